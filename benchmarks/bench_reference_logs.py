@@ -44,7 +44,7 @@ from roadscan.run.session import Reporter, Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.earth import Earth
-from roadscan.store.sql import query
+from roadscan.store.query.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 

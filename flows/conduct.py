@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +25,17 @@ from roadscan.run.progress import LineReporter
 from roadscan.run.selection import Selection
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, stages
+from roadscan.run.told import Asked, told_run
 from roadscan.store.store import Store
 from roadscan.survey.preflight import preflight
 from roadscan.survey.run import close_run, run_stage
 
 log_without_tracebacks()
+
+_BY_WORKER = "PREFECT__FLOW_RUN_ID"
+"""Variable that Prefect's workers set for the process of a run."""
+_LOOK_S = 1.0
+"""Time between looks at the worker (s)."""
 
 
 class FlowReporter(LineReporter):
@@ -40,31 +50,54 @@ class FlowReporter(LineReporter):
         self._logger.info(text)
 
 
+def end_with_worker() -> None:
+    """Let this process end soon after the worker that started it, if one did.
+
+    Nobody reads the run's output then. A run whose Dask workers were about to start has waited for them for ever, and
+    lived as far as the server could see.
+    """
+    worker = os.getppid()
+
+    def look() -> None:
+        while os.getppid() == worker:
+            time.sleep(_LOOK_S)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    if _BY_WORKER in os.environ:
+        threading.Thread(target=look, name="roadscan-worker-lives", daemon=True).start()
+
+
 def run_name() -> str:
     """Name of a flow run: its survey file and that file's folder, such as `city/SURVEY.toml`."""
     return "/".join(Path(flow_run.parameters["survey_file"]).parts[-2:])
 
 
 def conduct(
-    survey_file: str, workers: int | None, scheduler: str | None, selection: Selection | None = None
+    survey_file: str,
+    workers: int | None,
+    scheduler: str | None,
+    selection: Selection | None = None,
+    events: str | None = None,
+    metrics: str | None = None,
 ) -> State[Any]:
     """Run all stages; returns the flow run's final state.
 
     An error that the user can mend makes the run Failed with the error's own words; any other keeps its traceback.
     """
+    end_with_worker()
     try:
         survey = Survey.load(survey_file)
         store = Store(survey.store_url, survey.config.id)
-        reporter = FlowReporter()
         store.check_free()
-        preflight(survey, store, selection=selection).begin(reporter.line)
-        with store.lock(), compute_on(workers, scheduler) as compute:
-            run = Session(survey, store, compute, selection, reporter)
-            for stage in stages():
-                ended = stage_task(stage, run)()
-                if ended is not None:
-                    ended.result()  # raises the error of the stage
-            close_run(run, stages())
+        run = Session(survey, store, selection=selection, reporter=FlowReporter())
+        with told_run(run, [stage.name for stage in stages()], Asked.of(events, metrics)):
+            preflight(survey, store, selection=selection).begin(run.reporter.line)
+            with store.lock(), compute_on(workers, scheduler) as run.compute:
+                for stage in stages():
+                    ended = stage_task(stage, run)()
+                    if ended is not None:
+                        ended.result()  # raises the error of the stage
+                close_run(run, stages())
     except RoadscanError as error:
         return failed(error)
     return Completed(data={"raw_bytes_read": float(run.raw_bytes_read)})

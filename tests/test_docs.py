@@ -38,8 +38,8 @@ from roadscan.run.stage import stages
 from roadscan.site.layer import layer_kinds
 from roadscan.site.material import Material
 from roadscan.store.asset_schema import _files, asset_schema, asset_tables
+from roadscan.store.query.sql import query
 from roadscan.store.schema import _schema_files, table_schema
-from roadscan.store.sql import query
 from roadscan.survey.status import survey_status, verify_store
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.product import ProductContext, SurveyProduct, Tile, TileProduct, product_named, products

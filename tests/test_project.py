@@ -52,8 +52,8 @@ def test_every_dependency_is_pinned_within_its_range(text: str) -> None:
 
 REQUIRED = {
     "blake3", "cryptography", "dask", "distributed", "duckdb", "fsspec", "isal", "jinja2", "laspy", "numba", "numpy",
-    "pandas", "pillow", "prefect", "psutil", "pyarrow", "pydantic", "pyogrio", "pyproj", "pyyaml", "qdldl", "rasterio",
-    "rich", "scipy", "shapely", "typer",
+    "pandas", "pillow", "prefect", "prometheus-client", "psutil", "pyarrow", "pydantic", "pyogrio", "pyproj", "pyyaml",
+    "qdldl", "rasterio", "rich", "scipy", "shapely", "typer",
 }  # fmt: skip
 """What every installation has. Whatever only some surveys need belongs to an extra (`roadscan/core/extras.py`)."""
 MOST_DISTRIBUTIONS = 141

@@ -17,7 +17,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import block_diag
 
 from roadscan.adjust.control.control_test import COMPONENTS as SURVEYED
 from roadscan.adjust.control.control_test import AppliedOffset, ControlVerdict, SurveyErrors, applied_offset, judged
@@ -180,6 +179,8 @@ class Adjustment:
     @property
     def sigma(self) -> tuple[Float64, ...]:
         """Returns 1 σ (k, 6) of each run's knots, including that of an offset of the control."""
+        from scipy.linalg import block_diag
+
         common = block_diag(self.applied.covariance_m2, self.verdict.shift.covariance_m2)
         shared = [np.einsum("kia,ab,kib->ki", r, common, r) for r in self.response]
         return tuple(np.sqrt(np.einsum("kii->ki", c) + more) for c, more in zip(self.covariance, shared, strict=True))
@@ -537,6 +538,8 @@ def _of_cameras(unknowns: Unknowns, estimate: Estimate, solution: Float64) -> Ca
 
 def _joint(unknowns: Unknowns, estimate: Estimate) -> Iterator[JointErrors]:
     """Yield covariances of poses, mountings and lenses at knots of which the factor of the equations tells them."""
+    from scipy.linalg import block_diag
+
     keys = [one.key for one in unknowns.mountings]
     for camera, prior in enumerate(unknowns.cameras):
         for run, name in enumerate(one.run for one in unknowns.priors):

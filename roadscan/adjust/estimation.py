@@ -13,7 +13,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import chdtri
 
 from roadscan.adjust.observations import COMPONENTS, KINDS
 from roadscan.adjust.solver_settings import AdjustmentSettings
@@ -144,6 +143,8 @@ class Rounds:
         """Fix the components whose corrections the stated σ explains, by the quantile of χ², when all others have their
         factors: they only followed those.
         """
+        from scipy.special import chdtri
+
         for component in np.argsort(self._processes, kind="stable").tolist():
             if self._fixed[component]:
                 continue
@@ -251,6 +252,8 @@ class Rounds:
 
     def contradicts_poses(self, estimate: Estimate) -> bool:
         """Returns whether corrections of some component are larger than its process allows, by the quantile of χ²."""
+        from scipy.special import chdtri
+
         ratio, redundancy = self._process_ratios(estimate.solution, estimate.inverse)
         known = redundancy >= _SOME
         return bool((ratio * redundancy > chdtri(np.maximum(redundancy, _SOME), 1.0 - _SURE))[known].any())
@@ -261,6 +264,8 @@ class Rounds:
         Corrections are then larger than the process allows, by the quantile of χ² over all runs and components, and σ
         too small by what :data:`_UNDERSTATED` says, beside the factor that all runs have.
         """
+        from scipy.special import chdtri
+
         own = self._component < len(COMPONENTS)
         row, column, component = self._row[own], self._column[own], self._component[own]
         run = np.searchsorted(self.problem.unknowns.first, row, side="right") - 1

@@ -9,7 +9,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import gaussian_filter, minimum_filter
 
 from roadscan.adjust.kernels.patch_cells import Splat, splat
 from roadscan.adjust.patches import Patch
@@ -85,6 +84,8 @@ def _without_slow(mass: Float64, totals: Sequence[Float64]) -> list[Float64]:
     A running mean would be one-sided at the rims, and its error would be the same in all images, as if nothing had
     moved.
     """
+    from scipy.ndimage import gaussian_filter, minimum_filter
+
     pictures = [np.full(mass.shape, np.nan) for _ in totals]
     if not mass.any():
         return pictures

@@ -3,24 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from roadscan.assets.kind import AssetKind
 from roadscan.assets.kinds.lane_line import LaneLine
 from roadscan.assets.paint.contrast import ROUGHEST_M
-from roadscan.assets.tasks.drives import drives_key, load_drives
-from roadscan.assets.tasks.evidence import EVIDENCE, evidence_tasks, find_evidence, singly
-from roadscan.assets.tasks.gains import current_gains, find_samples, sample_tasks, write_gains
-from roadscan.assets.tasks.objects import OBJECTS, Cluster, join_objects, plan_joins
-from roadscan.assets.tasks.picture_work import PicturePlan, picture_tasks, plan_asset_pictures
-from roadscan.assets.tasks.pictures import FOLDER as PICTURE_FOLDER
-from roadscan.assets.tasks.pictures import find_pictures
-from roadscan.assets.tasks.plan import AssetPlan, check_assets
-from roadscan.assets.tasks.sections import SECTIONS, plan_sections, write_sections
-from roadscan.assets.tasks.tables import TABLES, plan_files, plan_tables, write_file, write_table
-from roadscan.assets.tasks.work import AssetsWork, due_joins, plan_evidence
-from roadscan.condition.tasks.lines import roads_key, survey_roads
-from roadscan.condition.tasks.tasks import run_units
 from roadscan.core.errors import RoadscanError
 from roadscan.core.extras import need
 from roadscan.core.survey import Survey
@@ -30,7 +17,12 @@ from roadscan.run.stage import Stage, StageState
 from roadscan.store.asset_schema import ASSET_FOLDER
 from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import Manifest
-from roadscan.tiles.tasks.tiles import run_tasks
+
+if TYPE_CHECKING:
+    from roadscan.assets.tasks.objects import Cluster
+    from roadscan.assets.tasks.picture_work import PicturePlan
+    from roadscan.assets.tasks.plan import AssetPlan
+    from roadscan.assets.tasks.work import AssetsWork
 
 _MOST_ROUGH: Final = 0.5
 """Share of rough ground from which readings are suspect: verges and kerbs are rough, but not half of the ground."""
@@ -65,6 +57,8 @@ class Assets(Stage):
 
     def run(self, session: Session) -> None:
         """Compute what is missing or stale."""
+        from roadscan.assets.tasks.work import plan_evidence
+
         work = plan_evidence(session)
         session.manifest.remove(work.gone)
         if work.plan is None:
@@ -81,6 +75,9 @@ class Assets(Stage):
 
     def _calibrate(self, session: Session, work: AssetsWork, plan: AssetPlan) -> None:
         """Compute what all squares share: samples of the map, then gains of the intensity and statistics."""
+        from roadscan.assets.tasks.gains import find_samples, sample_tasks, write_gains
+        from roadscan.tiles.tasks.tiles import run_tasks
+
         manifest, due = session.manifest, work.samples
         failures = run_tasks(
             find_samples, sample_tasks(plan, due), len(due), lambda squares: sample_tasks(plan, due, squares),
@@ -91,6 +88,10 @@ class Assets(Stage):
             manifest.add(write_gains(work.gains, manifest, plan, work.gains.key(manifest)))
 
     def _search(self, session: Session, work: AssetsWork, plan: AssetPlan) -> None:
+        from roadscan.assets.tasks.evidence import evidence_tasks, find_evidence, singly
+        from roadscan.assets.tasks.gains import current_gains
+        from roadscan.tiles.tasks.tiles import run_tasks
+
         manifest = session.manifest
         due, gains = work.squares, current_gains(work.gains, session.manifest)
         tasks = evidence_tasks(plan, due, gains, session.compute.workers)
@@ -102,6 +103,9 @@ class Assets(Stage):
 
     def _join(self, session: Session, plan: AssetPlan) -> None:
         """Join pieces kind after kind, each after those that it uses."""
+        from roadscan.assets.tasks.objects import join_objects, plan_joins
+        from roadscan.condition.tasks.tasks import run_units
+
         manifest = session.manifest
         clusters: dict[str, list[Cluster]] = {}
         for wanted in plan.kinds:
@@ -115,6 +119,10 @@ class Assets(Stage):
 
     def _look(self, session: Session, plan: AssetPlan) -> PicturePlan:
         """Search the pictures of objects, where there are any."""
+        from roadscan.assets.tasks.picture_work import picture_tasks, plan_asset_pictures
+        from roadscan.assets.tasks.pictures import find_pictures
+        from roadscan.condition.tasks.tasks import run_units
+
         manifest = session.manifest
         pictures = plan_asset_pictures(plan, manifest)
         for note in pictures.notes:
@@ -131,6 +139,11 @@ class Assets(Stage):
         return pictures
 
     def _write(self, session: Session, plan: AssetPlan, pictures: PicturePlan) -> None:
+        from roadscan.assets.tasks.drives import drives_key, load_drives
+        from roadscan.assets.tasks.sections import SECTIONS, plan_sections, write_sections
+        from roadscan.assets.tasks.tables import TABLES, plan_files, plan_tables, write_file, write_table
+        from roadscan.condition.tasks.lines import survey_roads
+
         manifest, context = session.manifest, plan.context
         roads, key = survey_roads(plan.survey, manifest)
         if plan.kinds and not roads.lines:
@@ -153,10 +166,14 @@ class Assets(Stage):
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
         """Returns a finding where most of the ground is too rough for the detection of paint."""
+        if not survey.has("assets"):
+            return ()
+        from roadscan.assets.tasks.evidence import EVIDENCE
+
         records_of = manifest.of(EVIDENCE)
         found = [one.figures() for unit, one in records_of.items() if unit.startswith(f"{LaneLine.name}/")]
         dense, rough = (sum(one.get(name, 0) for one in found) for name in ("dense_cells", "rough_cells"))
-        if not survey.has("assets") or rough <= _MOST_ROUGH * dense:
+        if rough <= _MOST_ROUGH * dense:
             return ()
         said = (
             f"Paint was not sought on {rough / dense:.0%} of the ground that is seen densely enough: its returns "
@@ -167,6 +184,8 @@ class Assets(Stage):
 
     def check(self, survey: Survey) -> list[RoadscanError]:
         """Check that kinds, their settings and sensors exist."""
+        from roadscan.assets.tasks.plan import check_assets
+
         try:
             if survey.has("assets"):
                 need("cv2", "the section [assets]")
@@ -179,6 +198,12 @@ class Assets(Stage):
         """Outputs of squares, objects and files that exist, and those that are due as far as is known by now."""
         if not session.survey.has("assets"):
             return StageState()
+        from roadscan.assets.tasks.evidence import EVIDENCE, evidence_tasks
+        from roadscan.assets.tasks.gains import current_gains
+        from roadscan.assets.tasks.objects import OBJECTS
+        from roadscan.assets.tasks.tables import TABLES
+        from roadscan.assets.tasks.work import due_joins, plan_evidence
+
         work = plan_evidence(session)
         plan, manifest = work.plan, session.manifest
         if plan is None:
@@ -195,6 +220,12 @@ class Assets(Stage):
         return state
 
     def _files_due(self, session: Session, plan: AssetPlan) -> int:
+        from roadscan.assets.tasks.drives import drives_key
+        from roadscan.assets.tasks.picture_work import plan_asset_pictures
+        from roadscan.assets.tasks.sections import SECTIONS, plan_sections
+        from roadscan.assets.tasks.tables import TABLES, plan_files, plan_tables
+        from roadscan.condition.tasks.lines import roads_key, survey_roads
+
         manifest, context = session.manifest, plan.context
         key = roads_key(plan.survey) + drives_key(plan)
         pictures = plan_asset_pictures(plan, manifest)
@@ -210,6 +241,8 @@ class Assets(Stage):
 
     def folders(self) -> Sequence[str]:
         """Returns folders: evidence, objects, tables and files, classified points, bare earth."""
+        from roadscan.assets.tasks.pictures import FOLDER as PICTURE_FOLDER
+
         return (
             "tables/intensity_samples", "tables/intensity_gains", "tables/scene_statistics", "tables/asset_evidence",
             "tables/asset_objects",

@@ -6,8 +6,6 @@ from collections.abc import Iterable
 
 import numpy as np
 import numpy.typing as npt
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
 Int64 = npt.NDArray[np.int64]
 
@@ -20,6 +18,9 @@ def touching(flat: Int64, steps: Iterable[int]) -> npt.NDArray[np.int32]:
     flat : (n,) numbers of the cells, ascending, each once: rows and layers apart so far that no step leaves them.
     steps : differences of the numbers of cells that touch, those that are positive.
     """
+    from scipy import sparse
+    from scipy.sparse.csgraph import connected_components
+
     edges = [np.empty((0, 2), np.int64)]
     for step in steps:
         at = np.searchsorted(flat, flat + step)

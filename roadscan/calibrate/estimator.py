@@ -15,7 +15,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from roadscan.calibrate.evidence import Evidence, Traverse
 from roadscan.calibrate.observability import Observability, observe
@@ -440,6 +439,8 @@ class _System:
 
     def solution(self, free: Float64 | None) -> Float64:
         """Return the solution z (P,) of the normal equations, with the mountings in the space of `free` (M, d)."""
+        from scipy.linalg import block_diag, cho_factor, cho_solve
+
         right = self.information @ self.z - self.slope
         if free is None:
             return self.covariance @ right
@@ -505,4 +506,6 @@ def _settled(
 
 def _inverse(matrix: Float64) -> Float64:
     """Return the inverse of a positive definite matrix."""
+    from scipy.linalg import cho_factor, cho_solve
+
     return np.asarray(cho_solve(cho_factor(0.5 * (matrix + matrix.T)), np.eye(len(matrix))))

@@ -14,7 +14,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import cho_factor, cho_solve
 
 from roadscan.calibrate.unknowns import MOUNTING, Unknowns
 
@@ -179,6 +178,8 @@ def _embedded(basis: Float64, active: npt.NDArray[np.int64], size: int) -> Float
 
 
 def _inverse(matrix: Float64) -> Float64:
+    from scipy.linalg import cho_factor, cho_solve
+
     return np.asarray(cho_solve(cho_factor(matrix), np.eye(len(matrix)))) if matrix.size else matrix
 
 

@@ -14,7 +14,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import eigh
 
 from roadscan.calibrate.evidence import AttitudeInfluence, Orientation
 from roadscan.calibrate.rotations import left_jacobian, logarithm
@@ -96,6 +95,8 @@ class OrientationObservations:
         ----------
         covariance : (P, P) of all unknowns from all evidence, these included, by :class:`Geometry`'s local changes.
         """
+        from scipy.linalg import eigh
+
         if not self.fixed_weight:
             return []
         jacobian = self._jacobian(now, len(covariance))

@@ -17,8 +17,6 @@ from typing import Final, Self
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field
-from scipy.linalg import eigh
-from scipy.spatial.transform import Rotation
 
 from roadscan.calibrate.evidence import Known, Seen, Ties
 from roadscan.calibrate.surfels import Surfels
@@ -220,11 +218,15 @@ class _Pose:
 
     def moved(self, step: Float64) -> Self:
         """Return the mounting after a step (6,): lever arm, then a small rotation about the body's axes."""
+        from scipy.spatial.transform import Rotation
+
         turn = Rotation.from_rotvec(step[3:]).as_matrix()
         return type(self)(turn @ self.rotation, self.lever_m + step[:3])
 
     def since(self, start: _Pose) -> Float64:
         """Return the step (6,) from `start` to this mounting."""
+        from scipy.spatial.transform import Rotation
+
         turn = Rotation.from_matrix(self.rotation @ start.rotation.T).as_rotvec()
         return np.concatenate([self.lever_m - start.lever_m, turn])
 
@@ -447,6 +449,8 @@ def _insensitive(readings: _Readings, pose: _Pose, normal: Float64, wobble: Floa
     vehicle where it is. Directions whose information is no more than a few times what such noise brings are taken
     out: each normal loses its part along the way that its reading would go.
     """
+    from scipy.linalg import eigh
+
     way = readings.ways(pose)
     rows = np.einsum("ni,nia->na", normal, way) / sigma_m[:, None]
     by_noise = np.einsum("nia,nij,njb,n->ab", way, wobble, way, sigma_m**-2.0, optimize=True)

@@ -17,7 +17,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import chdtrc, chdtri, gammaincinv
 
 from roadscan.calibrate.observations import Observations
 from roadscan.core.settings.calibration import CalibrationSettings
@@ -124,6 +123,8 @@ def variance_factor(weighed: Sequence[Weighed], scales: Scales, parameters: floa
     weighed : all observations of the kind.
     parameters : how many unknowns they determine, as the trace of their share of the solution.
     """
+    from scipy.special import gammaincinv
+
     squares = rows = whole = used = total_weight = 0.0
     for one in weighed:
         if one.observations.fixed_weight is not None:
@@ -150,6 +151,8 @@ def variance_factor(weighed: Sequence[Weighed], scales: Scales, parameters: floa
 @cache
 def length_limit(limit: float, rows: int) -> float:
     """Return the length of `rows` standard normal numbers that is exceeded as rarely as `limit` by one."""
+    from scipy.special import chdtrc, chdtri
+
     # Farther out, probabilities underflow.
     usual = min(limit, 30.0)
     return float(np.sqrt(chdtri(rows, chdtrc(1, usual**2)))) + limit - usual
@@ -158,4 +161,6 @@ def length_limit(limit: float, rows: int) -> float:
 @cache
 def _median(rows: int) -> float:
     """Return the median of the squared length of `rows` standard normal numbers."""
+    from scipy.special import gammaincinv
+
     return float(2.0 * gammaincinv(rows / 2.0, 0.5))

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix
-from scipy.spatial import cKDTree
 
 from roadscan.core.errors import ConfigError
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -87,6 +88,8 @@ class Surfels:
 
     @cached_property
     def _tree(self) -> cKDTree:
+        from scipy.spatial import cKDTree
+
         return cKDTree(self.centre_m)
 
     def nearest(self, place_m: Float64, gate_m: Float64) -> tuple[Int64, Float64]:
@@ -117,6 +120,8 @@ class Surfels:
         which each tilt resists. That is deceptive, because the tilt of the next patch differs. The scatter of the
         normals counts as the plane's uncertainty, and that of their mean as the normal's.
         """
+        from scipy.sparse import csr_matrix
+
         variance = np.trace(self.slopes, axis1=1, axis2=2) / 2.0
         pairs, sign = self._alike(variance)
         ones = np.arange(len(self))

@@ -5,9 +5,11 @@ Each module holds the commands of one group as plain functions; they become comm
 
 from __future__ import annotations
 
+import atexit
+import gc
 import io
 import sys
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
@@ -17,6 +19,7 @@ from roadscan.cli import (
     cleaning,
     estimates,
     exports,
+    fleets,
     inventory,
     logs,
     pages,
@@ -30,6 +33,10 @@ from roadscan.cli import (
 )
 from roadscan.cli.added_stages import Commands
 from roadscan.cli.ending import ending_well
+
+_OBJECTS: Final = 300_000
+"""New objects after which Python looks for garbage: modules make many and none of it, and looking took a fifth of a
+start, and a third of a short command at its end, where all is looked through once more."""
 
 app = typer.Typer(
     name="roadscan",
@@ -70,12 +77,14 @@ app.command("status")(state.status)
 app.command("verify")(state.verify)
 app.command("clean")(cleaning.clean)
 app.command("archive")(cleaning.archive)
+app.command("forget")(cleaning.forget)
 app.command("report")(reports.report)
 app.command("compare")(reports.compare)
 app.command("view")(pages.view)
 app.command("publish")(pages.publish)
 app.command("sql")(queries.sql)
 app.command("where")(queries.where)
+app.command("fleet")(fleets.fleet)
 
 export = typer.Typer(
     cls=exports.Exports, help="Readings and pictures as files of other programs.", no_args_is_help=True
@@ -111,8 +120,19 @@ for command in (
 app.add_typer(assets, name="inventory")
 
 
+def _leave() -> None:
+    """Let the process end without looking for garbage in what it leaves.
+
+    DuckDB would tell of each of its objects that nobody frees, so theirs are looked for.
+    """
+    if "duckdb" not in sys.modules:
+        gc.freeze()
+
+
 def main() -> None:
     """Run the command line; an error the user can mend is printed without a traceback."""
+    gc.set_threshold(_OBJECTS)
+    atexit.register(_leave)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal or pipe that knows no "─" or "σ" stops nothing

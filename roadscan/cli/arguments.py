@@ -118,6 +118,15 @@ SurveyOption = Annotated[
         autocompletion=surveys_for,
     ),
 ]
+SurveyOrFleet = Annotated[
+    Path | None,
+    typer.Option(
+        "--survey",
+        help="The survey file; the current folder's where it is left out.",
+        show_default=False,
+        autocompletion=surveys_for,
+    ),
+]
 Workers = Annotated[
     int | None, typer.Option(help="Worker processes of the embedded cluster; 0 computes in this process.")
 ]
@@ -129,6 +138,7 @@ Dashboard = Annotated[
         help="Serve Dask's dashboard of the embedded cluster; every user of this machine can look at it.",
     ),
 ]
+PlainJson = Annotated[bool, typer.Option("--json", help="Print JSON, and nothing else.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the summary as one JSON object, and nothing else.")]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -80,3 +81,71 @@ def archive(
     told += [f"{counted(len(done.faults), 'fault')}"] if done.faults else []
     typer.echo(", ".join(told) or "nothing to do")
     raise typer.Exit(1 if done.faults else 0)
+
+
+def forget(
+    survey_file: SurveyFile,
+    picture: Annotated[
+        list[str] | None, typer.Option(metavar="RUN/CAMERA/FILE", help="A picture. May be repeated.")
+    ] = None,
+    pictures: Annotated[
+        Path | None, typer.Option("--list", help="File with a picture's name a line; - for standard input.")
+    ] = None,
+    camera: Annotated[
+        str | None, typer.Option(metavar="RUN/CAMERA", help="All pictures of a camera between two times.")
+    ] = None,
+    span: Annotated[
+        str | None,
+        typer.Option(metavar="START/END", help="Two times, such as 2026-05-04T09:30:00Z/2026-05-04T09:30:10Z."),
+    ] = None,
+    why: Annotated[str, typer.Option(help="The reason, for the record.")] = "",
+    archive: Annotated[
+        list[str] | None,
+        typer.Option(help="An archive that has copies, also of pictures that went before. May be repeated."),
+    ] = None,
+    remove: Annotated[bool, typer.Option("--remove", help="Remove them. Without this, they are only listed.")] = False,
+) -> None:
+    """Remove pictures for people's privacy: their files and their copies in archives. It cannot be undone."""
+    from roadscan.core.counted import counted
+    from roadscan.core.errors import ConfigError
+    from roadscan.door import gps_ns_of
+    from roadscan.run.session import Session
+    from roadscan.survey.forget import choose_named, choose_taken
+    from roadscan.survey.forget import forget as let_go
+
+    names = [*(picture or ()), *(_lines(pictures) if pictures else ())]
+    if not names and camera is None and not archive:
+        expected = "--picture, --list, or --camera with --span; --archive alone takes those that went before"
+        raise ConfigError("no picture is named", expected=expected)
+    if span and (camera is None or span.count("/") != 1):
+        raise ConfigError(f"the span '{span}'", expected="START/END, and --camera RUN/CAMERA")
+    session = Session.open(survey_file)
+    with session.store.lock():
+        chosen = choose_named(session, names)
+        if camera is not None:
+            first, last = map(gps_ns_of, span.split("/")) if span else (None, None)
+            chosen += choose_taken(session, camera, first, last)
+        chosen = list(dict.fromkeys(chosen))
+        if remove and (chosen or archive):
+            told = let_go(session, chosen, why, archive or ())
+    for one in chosen:
+        typer.echo(one.name)
+    if not remove:
+        typer.echo(f"{counted(len(chosen), 'picture')}: nothing was removed: `--remove` does it, for ever")
+        return
+    if not chosen and not archive:
+        typer.echo("no picture was taken then")
+        return
+    typer.echo(f"{counted(told.removed, 'picture')} removed, and {told.archived:,} of their copies in archives")
+    for line in told.left:
+        typer.echo(f"still there: {line}")
+    typer.echo(
+        "what was made of them is still there: `roadscan run` makes it anew, `roadscan publish` the page, "
+        "`roadscan clean --remove` takes the rows that name them; other copies are yours to find"
+    )
+    raise typer.Exit(1 if told.left else 0)
+
+
+def _lines(file: Path) -> list[str]:
+    text = sys.stdin.read() if str(file) == "-" else file.read_text(encoding="utf-8")
+    return [line.strip() for line in text.splitlines() if line.strip()]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import typer
 
 from roadscan.cli.arguments import SurveyFile
-from roadscan.cli.survey import Where, opened_store, run_survey, stages_named
+from roadscan.cli.survey import Where, opened_store, run_survey
 from roadscan.cli.terminal import print_table
 
 
@@ -13,7 +13,7 @@ def clocks(survey_file: SurveyFile) -> None:
     """Clocks of sensors as they were estimated; estimates those that are missing or out of date."""
     from roadscan.navigation.tasks.clock_tables import kept_estimates
 
-    run = run_survey(survey_file, stages_named("navigate"), Where(0))
+    run = run_survey(survey_file, ["navigate"], Where(0))
     rows = [
         (e.run, e.sensor, f"{e.correction.offset_s:+.6f}", f"{e.correction.sigma_offset_s:.2g}",
          f"{e.correction.drift * 1e6:+.3f}", f"{e.correction.sigma_drift * 1e6:.2g}", e.method)

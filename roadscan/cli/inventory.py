@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadscan.cli.arguments import SurveyFile, SurveyOption
-from roadscan.cli.terminal import print_table
+from roadscan.cli.arguments import PlainJson, SurveyFile, SurveyOption
+from roadscan.cli.terminal import print_json, print_table
 
 if TYPE_CHECKING:
     from roadscan.inventory.inventory import Inventory
@@ -100,11 +101,15 @@ def diff(
     survey_file: SurveyOption,
     before: Annotated[str, typer.Argument(help="A day (UTC), an instant with zone, or a commit's number.")],
     after: Annotated[str | None, typer.Argument(help="The same; today where it is left out.")] = None,
+    as_json: PlainJson = False,
 ) -> None:
     """What differs between two times."""
     from roadscan.inventory.diff import shown
 
     found = _opened(survey_file).diff(before, after)
+    if as_json:
+        print_json([one._asdict() for one in found])
+        return
     rows = [(d.change, d.asset_id, d.attribute, *(shown(d) if d.attribute else ("", ""))) for d in found[:_MOST_LINES]]
     print_table(("change", "asset", "attribute", "before", "after"), rows)
     _tell_rest(len(found))
@@ -140,9 +145,13 @@ def changes(
 def history(
     survey_file: SurveyOption,
     asset: Annotated[str, typer.Argument(help="Id of the asset.")],
+    as_json: PlainJson = False,
 ) -> None:
     """All that was found of an asset and edited."""
     events = _opened(survey_file).history(asset)
+    if as_json:
+        print_json([event._asdict() for event in events])
+        return
     rows = [(str(e.commit), e.at, e.who, e.what, e.attribute, _short(e.old), _short(e.new), e.why) for e in events]
     print_table(("commit", "when", "who", "what", "attribute", "old", "new", "why"), rows)
 
@@ -158,8 +167,12 @@ def undo(
     typer.echo(f"commit {done.number} undoes commit {commit}; `roadscan inventory publish` shows it")
 
 
-def log(survey_file: SurveyFile) -> None:
+def log(survey_file: SurveyFile, as_json: PlainJson = False) -> None:
     """All commits: what was found, edited and undone, by whom and why."""
+    commits = _opened(survey_file).truth.commits
+    if as_json:
+        print_json([dataclasses.asdict(commit) for commit in commits])
+        return
     rows = [
         (
             str(c.number),
@@ -170,7 +183,7 @@ def log(survey_file: SurveyFile) -> None:
             c.who,
             c.why,
         )
-        for c in _opened(survey_file).truth.commits
+        for c in commits
     ]
     print_table(("commit", "when", "kind", "of", "rows", "who", "why"), rows)
 

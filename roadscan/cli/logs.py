@@ -8,8 +8,8 @@ from typing import Annotated, Final, Literal
 
 import typer
 
-from roadscan.cli.arguments import formats_for
-from roadscan.cli.terminal import looking, print_table
+from roadscan.cli.arguments import PlainJson, formats_for
+from roadscan.cli.terminal import looking, print_json, print_table
 
 _MOST_REJECTS: Final = 20  # messages that are listed singly
 
@@ -19,11 +19,16 @@ def list_formats(
         str | None,
         typer.Argument(help="Show the settings of one format.", show_default=False, autocompletion=formats_for),
     ] = None,
+    as_json: PlainJson = False,
 ) -> None:
     """Raw formats that can be read, and what they yield."""
     from roadscan.core.strict import meanings
     from roadscan.ingest.reading.format import format_named, log_formats
 
+    if as_json:
+        chosen = log_formats() if name is None else {name: format_named(name)}
+        print_json([{"format": n, "yields": f.yields, "title": f.title, "time": f.time} for n, f in chosen.items()])
+        return
     if name is None:
         rows = [(n, ", ".join(f.yields), f.title) for n, f in log_formats().items()]
         print_table(("format", "yields", "what"), rows)

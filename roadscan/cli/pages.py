@@ -117,20 +117,29 @@ def view(
             "clicked in pictures into a file.",
         ),
     ] = False,
+    access: Annotated[
+        Path | None,
+        typer.Option(help="File that says who may see and edit the page behind a proxy that knows its users."),
+    ] = None,
 ) -> None:
-    """Look at the survey in a browser, while or after a run. The page is for this machine alone; Ctrl-C ends it."""
+    """Look at the survey in a browser, while or after a run; Ctrl-C ends it.
+
+    Without --access the page is for this machine alone.
+    """
     import webbrowser
 
+    from roadscan.site.access import Access
     from roadscan.site.doors import doors_of
     from roadscan.site.live import LiveSite, open_survey
     from roadscan.site.server import SiteServer
     from roadscan.site.web_part import HOW_TO_BUILD, web_folder
 
+    allowed = None if access is None else Access.load(access)
     site = LiveSite(open_survey(survey_file, over or (), edited=edit))
-    with SiteServer(site, port, doors_of(site, survey_file, edited=edit)) as server:
+    with SiteServer(site, port, doors_of(site, survey_file, edited=edit), allowed) as server:
         if web_folder() is None:
             typer.echo(f"note: the data are served without the page: {HOW_TO_BUILD}")
         typer.echo(f"page: {server.address} (Ctrl-C ends it)")
-        if browser and web_folder() is not None:
+        if browser and allowed is None and web_folder() is not None:
             webbrowser.open(server.address)
         server.serve_forever()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from roadscan.cli.arguments import SurveyOption, options_apart
+from roadscan.cli.arguments import SurveyOption, SurveyOrFleet, found_survey, options_apart
 from roadscan.cli.terminal import print_table, print_whole
 
 if TYPE_CHECKING:
@@ -22,11 +22,22 @@ if TYPE_CHECKING:
 _MOST_ROWS = 200  # rows that a terminal shows
 
 
-def sql(
+def sql(  # noqa: PLR0913  each is an option of the command
     statement: Annotated[str, typer.Argument(help="DuckDB statement over the views (SHOW TABLES lists them).")],
-    survey_file: SurveyOption,
+    survey_file: SurveyOrFleet = None,
+    fleet: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Ask all surveys of a folder or bucket at once: each table has a column survey; fleet is the "
+            "catalogue.",
+        ),
+    ] = None,
     csv: Annotated[
         bool, typer.Option("--csv", help="Print comma-separated values: ISO times, plain numbers, lists as JSON.")
+    ] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print a list of objects as JSON, and nothing else; values as in --csv.")
     ] = False,
     wide: Annotated[bool, typer.Option("--wide", help="Do not wrap lines at the terminal's width.")] = False,
     unconfined: Annotated[
@@ -47,16 +58,23 @@ def sql(
     The statement reaches the store's files and memory alone. Ends with 1 where a damaged file is missing from the
     answer, or in it.
     """
-    from roadscan.core.errors import AnswerError, StoreError
+    from roadscan.core.errors import AnswerError, ConfigError, StoreError
     from roadscan.run.session import Session
-    from roadscan.store.sql import Limits
+    from roadscan.store.query.sql import Limits
     from roadscan.survey.ask import ask
 
+    if fleet is not None and survey_file is not None:
+        raise ConfigError("--fleet and --survey are both given", expected="one of them")
     limits = Limits(timeout, None if memory is None else round(memory * 1e9))
-    session = Session.open(survey_file)
     damaged: list[StoreError] = []
     try:
-        result = ask(session.survey, session.store, statement, damaged, unconfined=unconfined, limits=limits)
+        if fleet is not None:
+            from roadscan.fleet.ask import ask_fleet
+
+            result = ask_fleet(fleet, statement, damaged, unconfined=unconfined, limits=limits)
+        else:
+            session = Session.open(survey_file or found_survey())
+            result = ask(session.survey, session.store, statement, damaged, unconfined=unconfined, limits=limits)
     finally:
         for error in damaged:
             typer.echo(f"{'damaged' if isinstance(error, AnswerError) else 'not shown'}: {error}", err=True)
@@ -64,6 +82,10 @@ def sql(
         from roadscan.store.csv import write_csv
 
         write_csv(result, sys.stdout.buffer)
+    elif as_json:
+        from roadscan.store.csv import write_json
+
+        write_json(result, sys.stdout.buffer)
     else:
         _show(result, wide)
     raise typer.Exit(1 if damaged else 0)

@@ -3,26 +3,46 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadscan.cli.arguments import USUAL, AsJson, Dashboard, Scheduler, SurveyFile, Workers, surveys_for
+from roadscan.cli.arguments import USUAL, AsJson, Dashboard, Scheduler, SurveyFile, Workers, options_apart, surveys_for
 from roadscan.cli.state import plan
-from roadscan.cli.survey import Where, run_and_sum_up, run_survey, stages_named, sum_up
-from roadscan.cli.terminal import print_table
+from roadscan.cli.survey import Where, run_and_sum_up, run_survey, sum_up
+from roadscan.cli.terminal import print_json, print_table
 
 if TYPE_CHECKING:
     from roadscan.run.selection import Selection
 
 
+@dataclass(frozen=True)
+class ToldOptions:
+    """Files that a run writes about itself."""
+
+    events: Annotated[
+        Path | None,
+        typer.Option(help="Append the run's events to this file, as lines of JSON (also: ROADSCAN_EVENTS)."),
+    ] = None
+    metrics: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write the run's figures for Prometheus to this file FILE.prom, or into this folder (also: "
+            "ROADSCAN_METRICS)."
+        ),
+    ] = None
+
+
+@options_apart
 def run(
     survey_file: SurveyFile,
     workers: Workers = None,
     scheduler: Scheduler = None,
     dashboard: Dashboard = False,
     as_json: AsJson = False,
+    told: ToldOptions = ToldOptions(),
     flow: Annotated[bool, typer.Option("--flow", help="Record a Prefect flow run even without an API.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only say what would be done: `plan`.")] = False,
 ) -> None:
@@ -37,12 +57,11 @@ def run(
         if dashboard:
             raise ConfigError("--dashboard of a flow run", expected="a run without Prefect", change="leave one out")
         require_api()
-        survey(str(survey_file), workers, scheduler)
+        survey(str(survey_file), workers, scheduler, *(str(f) if f else None for f in (told.events, told.metrics)))
         sum_up(survey_file, as_json)
         return
-    from roadscan.run.stage import stages
-
-    run_and_sum_up(survey_file, stages(), Where(workers, scheduler, dashboard), as_json)
+    where = Where(workers, scheduler, dashboard, told.events, told.metrics)
+    run_and_sum_up(survey_file, None, where, as_json)
 
 
 def ingest(
@@ -53,24 +72,32 @@ def ingest(
     as_json: AsJson = False,
 ) -> None:
     """Raw logs into tables."""
-    run_and_sum_up(survey_file, stages_named("ingest"), Where(workers, scheduler, dashboard), as_json)
+    run_and_sum_up(survey_file, ["ingest"], Where(workers, scheduler, dashboard), as_json)
 
 
-def navigate(survey_file: SurveyFile) -> None:
+def navigate(survey_file: SurveyFile, as_json: AsJson = False) -> None:
     """Trajectories from GNSS, IMU and odometer, and clocks from shared motion."""
     from roadscan.ingest.ingest import survey_records
     from roadscan.navigation.tasks.navigate import plan_trajectories
 
-    run = run_survey(survey_file, stages_named("navigate"), Where(0))
-    if not plan_trajectories(run.survey, run.store, survey_records(run.survey, run.store)):
+    run = run_survey(survey_file, ["navigate"], Where(0))
+    if as_json:
+        sum_up(survey_file, as_json)
+    elif not plan_trajectories(run.survey, run.store, survey_records(run.survey, run.store)):
         typer.echo("no trajectory to compute: each run has a trajectory log, or no GNSS and IMU")
 
 
 def footprints(
-    survey_file: SurveyFile, workers: Workers = None, scheduler: Scheduler = None, dashboard: Dashboard = False
+    survey_file: SurveyFile,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    dashboard: Dashboard = False,
+    as_json: AsJson = False,
 ) -> None:
     """Which raw block touches which tile."""
-    run_survey(survey_file, stages_named("footprints"), Where(workers, scheduler, dashboard))
+    run_survey(survey_file, ["footprints"], Where(workers, scheduler, dashboard))
+    if as_json:
+        sum_up(survey_file, as_json)
 
 
 def tile(
@@ -81,7 +108,7 @@ def tile(
     as_json: AsJson = False,
 ) -> None:
     """Readings into points, cells and tile files."""
-    run_and_sum_up(survey_file, stages_named("tiles"), Where(workers, scheduler, dashboard), as_json)
+    run_and_sum_up(survey_file, ["tiles"], Where(workers, scheduler, dashboard), as_json)
 
 
 def surfaces(
@@ -92,7 +119,7 @@ def surfaces(
     as_json: AsJson = False,
 ) -> None:
     """Cells or points of tiles into the reconstructed surface and its files (section `surface` of the survey file)."""
-    run_and_sum_up(survey_file, stages_named("surfaces"), Where(workers, scheduler, dashboard), as_json)
+    run_and_sum_up(survey_file, ["surfaces"], Where(workers, scheduler, dashboard), as_json)
 
 
 def make_products(
@@ -111,7 +138,7 @@ def make_products(
 ) -> None:
     """Mosaics, pictures and tables over all tiles; without a survey file, list the products there are."""
     if survey_file is not None:
-        run_and_sum_up(survey_file, stages_named("products"), Where(workers, scheduler, dashboard), as_json)
+        run_and_sum_up(survey_file, ["products"], Where(workers, scheduler, dashboard), as_json)
         return
     from roadscan.tiles.product import SurfaceProduct, TileProduct, products
 
@@ -126,7 +153,11 @@ def make_products(
         )
         for name, p in products().items()
     ]
-    print_table(("product", "of", "made", "what"), rows)
+    head = ("product", "of", "made", "what")
+    if as_json:
+        print_json([dict(zip(head, row, strict=True)) for row in rows])
+        return
+    print_table(head, rows)
 
 
 def reprocess(
@@ -141,13 +172,10 @@ def reprocess(
 ) -> None:
     """Compute some tiles once more, whether stale or not."""
     from roadscan.core.errors import ConfigError
-    from roadscan.run.stage import stages
 
     if not (tiles or bbox or span):
         raise ConfigError("nothing was chosen", expected="--tile, --bbox or --span")
-    done = run_and_sum_up(
-        survey_file, stages(), Where(workers, scheduler, dashboard), as_json, selected(tiles, bbox, span)
-    )
+    done = run_and_sum_up(survey_file, None, Where(workers, scheduler, dashboard), as_json, selected(tiles, bbox, span))
     typer.echo(f"read {done.raw_bytes_read / 1e6:,.1f} MB of readings", err=as_json)
 
 

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from roadscan.cli.arguments import AsJson, Workers, scenes_for
+from roadscan.cli.arguments import AsJson, PlainJson, Workers, scenes_for
 from roadscan.cli.survey import Where, run_survey, sum_up
-from roadscan.cli.terminal import print_table
+from roadscan.cli.terminal import print_json, print_table
 
 
 def simulate(
@@ -40,12 +40,20 @@ def simulate(
     typer.echo(f"survey file: {made.survey_file}")
 
 
-def list_scenes() -> None:
+def list_scenes(as_json: PlainJson = False) -> None:
     """List the scenes that ship with roadscan."""
     from roadscan.simulate import Scene
     from roadscan.simulate.scene import shipped_scenes
 
     scenes = {name: Scene.load(name) for name in shipped_scenes()}
+    if as_json:
+        print_json(
+            [
+                {"scene": name, "length_m": one.length_m, "passes": len(one.passes), "title": one.title}
+                for name, one in scenes.items()
+            ]
+        )
+        return
     print_table(
         ("scene", "length m", "passes", "what"),
         [(name, f"{one.length_m:g}", str(len(one.passes)), one.title) for name, one in scenes.items()],
@@ -59,11 +67,10 @@ def demo(
 ) -> None:
     """Simulate a small survey, run it, and compare the surface with the truth."""
     from roadscan.demo.demo import prepare_demo, summarise
-    from roadscan.run.stage import stages
     from roadscan.site.demo_page import page_lines
 
     survey_file = prepare_demo(out, lambda text: typer.echo(text, err=as_json))
-    run_survey(survey_file, stages(), Where(workers))
+    run_survey(survey_file, None, Where(workers))
     compared, street = summarise(survey_file), _street_in_two_epochs(out / "street", workers, as_json)
     sum_up(survey_file, as_json, {"height_error_m": compared.height_error(), "inventory": street})
     for line in () if as_json else (*compared.lines(), *street, *page_lines(survey_file)):
@@ -73,11 +80,9 @@ def demo(
 def _street_in_two_epochs(folder: Path, workers: int | None, as_json: bool) -> list[str]:
     """Survey the demo's street twice, with an edit by hand between; what its inventory says then."""
     from roadscan.demo.demo_street import AUTUMN, SPRING, STAGES, compare_epochs, edit_by_hand, prepare_street
-    from roadscan.run.stage import stage_named
 
-    wanted = tuple(stage_named(name) for name in STAGES)
     files = [prepare_street(folder, epoch, lambda text: typer.echo(text, err=as_json)) for epoch in (SPRING, AUTUMN)]
-    run_survey(files[0], wanted, Where(workers))
+    run_survey(files[0], STAGES, Where(workers))
     edit = edit_by_hand(files[0])
-    run_survey(files[1], wanted, Where(workers))
+    run_survey(files[1], STAGES, Where(workers))
     return compare_epochs(files[1], edit)

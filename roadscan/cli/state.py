@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from roadscan.cli.arguments import SurveyFile, Workers
-from roadscan.cli.terminal import new_reporter, print_table
+from roadscan.cli.arguments import PlainJson, SurveyFile, Workers
+from roadscan.cli.terminal import new_reporter, print_json, print_table
 
 if TYPE_CHECKING:
     from roadscan.survey.plan import PlannedStage, RunPlan
@@ -22,10 +22,13 @@ _PIPE_COLUMNS: Final = 120
 """Width of a plan in letters where there is no terminal."""
 
 
-def status(survey_file: SurveyFile) -> None:
+def status(survey_file: SurveyFile, as_json: PlainJson = False) -> None:
     """What is ingested, current, stale and failed, and how much is due."""
     found = found_status(survey_file)
-    print_status(found, survey_file)
+    if as_json:
+        print_json(found.as_json())
+    else:
+        print_status(found, survey_file)
     if not found.is_complete:
         raise typer.Exit(1)
 
@@ -62,6 +65,7 @@ def verify(
     accept_losses: Annotated[
         bool, typer.Option("--accept-losses", help="Accept that rows whose logs are gone are lost; they stay listed.")
     ] = False,
+    as_json: PlainJson = False,
 ) -> None:
     """Read every file the store should hold, and say which are missing or damaged, and which rows are lost."""
     from roadscan.core.counted import counted
@@ -84,6 +88,10 @@ def verify(
     if accept_losses:
         accept(session.store)
     lost = read_lost(session.store)
+    code = 1 if faults or any(not one.accepted for one in lost) else 0
+    if as_json:
+        print_json({"faults": faults, "repaired": told, "lost": [one.as_json() for one in lost]})
+        raise typer.Exit(code)
     for line in [*told, *(f"lost: {one.told}" for one in lost), *faults]:
         typer.echo(line)
     rows = sum(one.rows for one in lost)
@@ -91,7 +99,7 @@ def verify(
     are = "is" if len(faults) == 1 else "are"
     whole = f"{counted(len(faults), 'file')} {are} not whole" if faults else "every file is whole"
     typer.echo(f"{whole}{gone}")
-    raise typer.Exit(1 if faults or any(not one.accepted for one in lost) else 0)
+    raise typer.Exit(code)
 
 
 def found_plan(survey_file: Path, workers: int | None) -> RunPlan:

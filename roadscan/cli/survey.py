@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -11,7 +12,6 @@ from roadscan.cli.terminal import new_reporter
 if TYPE_CHECKING:
     from roadscan.run.selection import Selection
     from roadscan.run.session import Session
-    from roadscan.run.stage import Stage
     from roadscan.store.store import Store
 
 
@@ -24,19 +24,16 @@ class Where(NamedTuple):
     """Address of a Dask scheduler that runs elsewhere."""
     dashboard: bool = False
     """Whether the embedded cluster serves Dask's dashboard."""
-
-
-def stages_named(name: str) -> tuple[Stage, ...]:
-    """The stage of this name, as the stages of a run."""
-    from roadscan.run.stage import stages
-
-    return tuple(s for s in stages() if s.name == name)
+    events: Path | None = None
+    """File of the run's events; the environment may name one, too."""
+    metrics: Path | None = None
+    """File of the run's figures for Prometheus; the environment may name one, too."""
 
 
 def run_survey(
-    survey_file: Path, stages: tuple[Stage, ...], where: Where, selection: Selection | None = None
+    survey_file: Path, names: Collection[str] | None, where: Where, selection: Selection | None = None
 ) -> Session:
-    """The run of these stages, when it is done.
+    """The run of the stages of these names (None: of all), when it is done.
 
     Raises
     ------
@@ -45,43 +42,54 @@ def run_survey(
     """
     from roadscan.core.stopping import Stopped
     from roadscan.run.engine.compute_on import compute_on
+    from roadscan.run.progress import compiling_told
     from roadscan.run.session import Session
+    from roadscan.run.stage import stages
+    from roadscan.run.told import Asked, told_run
     from roadscan.survey.preflight import preflight
     from roadscan.survey.run import run_stages
 
+    chosen = tuple(one for one in stages() if names is None or {one.name, one.word} & {*names})
+    if not any(one.uses_workers for one in chosen):
+        where = where._replace(workers=0)
     run, reporter = Session.open(survey_file), new_reporter()
     run.selection, run.reporter = selection, reporter
-    preflight(run.survey, run.store, stages[-1].name, selection).begin(reporter.line)
 
     def at(address: str) -> None:
         reporter.line(f"dashboard: {address}")
 
-    with compute_on(where.workers, where.scheduler, at if where.dashboard else None) as run.compute:
-        try:
-            run_stages(run, stages)
-        except Stopped as stop:
-            stop.add_note(f"{reporter.where(run.stage)}; the next run goes on from there")
-            raise
-        finally:
-            reporter.close()
+    asked = Asked.of(where.events, where.metrics)
+    with told_run(run, [stage.name for stage in chosen], asked), compiling_told(run.reporter):
+        preflight(run.survey, run.store, chosen[-1].name, selection).begin(run.reporter.line)
+        with compute_on(where.workers, where.scheduler, at if where.dashboard else None) as run.compute:
+            try:
+                run_stages(run, chosen)
+            except Stopped as stop:
+                stop.add_note(f"{reporter.where(run.stage)}; the next run goes on from there")
+                raise
+            finally:
+                reporter.close()
     return run
 
 
 def run_and_sum_up(
     survey_file: Path,
-    stages: tuple[Stage, ...],
+    names: Collection[str] | None,
     where: Where,
     as_json: bool,
     selection: Selection | None = None,
 ) -> Session:
-    """The same, with a summary of the survey printed at the end, also of a run of which some units failed."""
+    """The same, with a summary of the survey printed at the end, also of a run of which some units failed.
+
+    Whether someone else works on the store is asked first, before the stages are imported.
+    """
     from roadscan.core.errors import RunError
 
     store = opened_store(survey_file)
     store.check_free()
     with store.looked():
         try:
-            run = run_survey(survey_file, stages, where, selection)
+            run = run_survey(survey_file, names, where, selection)
         except RunError:
             sum_up(survey_file, as_json)
             raise

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
@@ -17,6 +18,11 @@ def print_table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]], numbers:
     aligned = [str.rjust if name in numbers else str.ljust for name in head]
     for row in [head, tuple("─" * w for w in widths), *rows]:
         typer.echo("  ".join(to(str(v), w) for v, w, to in zip(row, widths, aligned, strict=True)).rstrip())
+
+
+def print_json(value: Any) -> None:
+    """Print values as JSON; numbers and texts as they are, anything else in words."""
+    typer.echo(json.dumps(value, indent=2, ensure_ascii=False, default=str))
 
 
 def print_whole(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> None:

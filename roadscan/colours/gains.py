@@ -7,8 +7,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_matrix
-from scipy.sparse.linalg import splu
 
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
@@ -112,6 +110,9 @@ def _pairs(samples: list[PictureSample]) -> tuple[Int64, Int64, Float64, Float64
 
 def _solved(count: int, first: Int64, second: Int64, ratio: Float64, weight: Float64) -> Float64:
     """Returns logarithms (count,) of gains: that of the second less that of the first is the ratio of each pair."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.linalg import splu
+
     rows = np.concatenate([first, second, first, second, np.arange(count)])
     columns = np.concatenate([first, second, second, first, np.arange(count)])
     values = np.concatenate([weight, weight, -weight, -weight, np.full(count, 1.0 / _PRIOR**2)])

@@ -8,7 +8,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import distance_transform_edt, gaussian_filter, grey_opening, map_coordinates
 
 from roadscan.core.grid import Bounds
 from roadscan.tiles.cells import TileCells
@@ -49,6 +48,8 @@ class Ground:
 
     def at(self, easting_m: Float64, northing_m: Float64) -> tuple[Float64, npt.NDArray[np.float32]]:
         """Returns heights (n,) at places of the map, NaN without ground, and unit normals (n, 3)."""
+        from scipy.ndimage import map_coordinates
+
         place = np.stack([(northing_m - self.origin_m[1]) / self.step_m, (easting_m - self.origin_m[0]) / self.step_m])
         height, east, north = (
             map_coordinates(values, place, order=1, mode="nearest") for values in (self.height_m, self.east, self.north)
@@ -100,6 +101,8 @@ def _readings(
 
 def _standing(lowest_m: Float64, step_m: float) -> npt.NDArray[np.bool_]:
     """Returns a mask (rows, columns) of cells in which something stands on the ground."""
+    from scipy.ndimage import distance_transform_edt, grey_opening
+
     known = ~np.isnan(lowest_m)
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     filled = lowest_m[tuple(nearest)]
@@ -113,6 +116,8 @@ def _standing(lowest_m: Float64, step_m: float) -> npt.NDArray[np.bool_]:
 
 def _fitted(mean_m: Float64, low: tuple[float, float], step_m: float) -> Ground | None:
     """Returns planes fitted around each cell of the lattice: their heights in its middle, and their slopes."""
+    from scipy.ndimage import gaussian_filter
+
     known = ~np.isnan(mean_m)
     if not known.any():
         return None

@@ -4,26 +4,64 @@ from __future__ import annotations
 
 import ast
 import functools
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
 
-import numpy.typing as npt
-
-from roadscan.compute.compiler import cache_folder, compiled
 from roadscan.core.kept import kept
 
+if TYPE_CHECKING:
+    import numpy.typing as npt
+
 Kernel = Callable[..., Any]
+
+_ONE_AT_A_TIME: Final = threading.RLock()
+"""Two threads that call a kernel first would each hand it to Numba, and compile it twice."""
+
+
+class _Late:
+    """A function that Numba is given when it is first called, or compiled into a caller.
+
+    To load Numba and to hand it the 600 functions that a survey's modules define takes half a second; who calls none of
+    them does not wait for that.
+    """
+
+    def __init__(self, function: Kernel, **options: bool) -> None:
+        functools.update_wrapper(self, function)
+        self.py_func, self._options = function, options
+        self._made: Kernel | None = None
+
+    def __call__(self, *given: Any, **named: Any) -> Any:
+        return (self._made or self._compiled())(*given, **named)
+
+    def __getattr__(self, name: str) -> Any:
+        """Whatever Numba and tests ask of a compiled function, above all its type."""
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self._made or self._compiled(), name)
+
+    def __reduce__(self) -> str:
+        return self.__qualname__  # type: ignore[no-any-return]
+
+    def _compiled(self) -> Kernel:
+        from roadscan.compute.compiler import compiled
+
+        with _ONE_AT_A_TIME:
+            if self._made is None:
+                folder = _folder_of_source(self.py_func.__code__.co_filename)
+                self._made = compiled(self.py_func, folder, **self._options)
+        return self._made
 
 
 def kernel(function: Kernel) -> Kernel:
     """Compile a loop over arrays into a kernel that Python calls."""
-    return compiled(function, _folder_of(function), counted=True)
+    return _Late(function, counted=True)
 
 
 def inner(function: Kernel) -> Kernel:
     """Compile a loop that kernels alone call: an entry for Python would take as long to make as a small function."""
-    return compiled(function, _folder_of(function), counted=True, entry=False)
+    return _Late(function, counted=True, entry=False)
 
 
 def bare(function: Kernel) -> Kernel:
@@ -32,22 +70,22 @@ def bare(function: Kernel) -> Kernel:
     Counting a reference up and down takes 20 ns; called for a thousand readings at a time, a kernel of ten arrays would
     spend as long on that as on the readings.
     """
-    return compiled(function, _folder_of(function), counted=False)
+    return _Late(function, counted=False)
 
 
 def bare_inner(function: Kernel) -> Kernel:
     """Compile a loop that `bare` kernels alone call; it makes no array either."""
-    return compiled(function, _folder_of(function), counted=False, entry=False)
+    return _Late(function, counted=False, entry=False)
 
 
 def inlined(function: Kernel) -> Kernel:
     """Compile a piece of a kernel into its callers; it takes numbers and tuples, no arrays in hot loops."""
-    return compiled(function, _folder_of(function), counted=True, entry=False, inlined=True)
+    return _Late(function, counted=True, entry=False, inlined=True)
 
 
 def bare_inlined(function: Kernel) -> Kernel:
     """Compile a piece of a `bare` kernel into it; it makes no array either."""
-    return compiled(function, _folder_of(function), counted=False, entry=False, inlined=True)
+    return _Late(function, counted=False, entry=False, inlined=True)
 
 
 def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -61,13 +99,11 @@ def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return view
 
 
-def _folder_of(function: Kernel) -> str:
-    return _folder_of_source(function.__code__.co_filename)
-
-
 @functools.cache
 def _folder_of_source(source: str) -> str:
     """Folder for the compiled kernels of a source file: it changes with the file and the kernels that it imports."""
+    from roadscan.compute.compiler import cache_folder
+
     file, library = Path(source), Path(__file__).parents[1]
     if not file.is_relative_to(library):
         return cache_folder("kernels", _reached(file))

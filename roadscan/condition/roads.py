@@ -9,8 +9,6 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 import scipy
-from scipy.ndimage import uniform_filter1d
-from scipy.spatial import cKDTree
 
 from roadscan.compute.kernels.curved_grid import thin_path
 from roadscan.compute.ways import smoothed_knots, way_along
@@ -144,6 +142,8 @@ def _lines_of_drives(ways: Sequence[tuple[Drive, Float64]], config: ConditionCon
 
 def _again(way: Float64, near_m: float) -> Bool:
     """Return nodes of a drive at which it is on a road that it drove before."""
+    from scipy.spatial import cKDTree
+
     direction = _directions(way)
     tree = cKDTree(way)
     again = np.zeros(len(way), bool)
@@ -158,6 +158,8 @@ class _Net:
     """Index of lines by place."""
 
     def __init__(self, lines: Sequence[RoadLine], near_m: float) -> None:
+        from scipy.spatial import cKDTree
+
         self._lines, self._near_m = lines, near_m
         self._nodes = np.concatenate([np.zeros((0, 2)), *(line.nodes_m for line in lines)])
         self._directions = np.concatenate([np.zeros((0, 2)), *(_directions(line.nodes_m) for line in lines)])
@@ -204,6 +206,8 @@ class _Net:
 
 
 def _piece(drive: Drive, sign: int, station: Float64, offset: Float64, smoothing_m: float) -> _Piece | None:
+    from scipy.ndimage import uniform_filter1d
+
     order = np.argsort(station, kind="stable")
     station, offset = station[order], offset[order]
     first, last = int(np.ceil(station[0] - 1e-6)), int(np.floor(station[-1] + 1e-6))

@@ -3,23 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from roadscan.condition.index import condition_indices
 from roadscan.condition.roads import LEAST_M
 from roadscan.condition.settings import ConditionConfig
-from roadscan.condition.tasks.lines import LINES, check_layer, write_lines
-from roadscan.condition.tasks.pictures import draw_picture
-from roadscan.condition.tasks.ravelling import patches_of_group
-from roadscan.condition.tasks.road_edges import check_edge_polygons, edges_of_pieces
-from roadscan.condition.tasks.roughness_regions import regions_of_pieces
-from roadscan.condition.tasks.sections import known_sections, write_sections
-from roadscan.condition.tasks.stretches import stretch_tasks, survey_stretches
-from roadscan.condition.tasks.surface_cells import check_surface_cells
-from roadscan.condition.tasks.tasks import P, PieceTask, S, run_units
-from roadscan.condition.tasks.tile_summary import write_tiles
-from roadscan.condition.tasks.values import GroupTask, value_findings, values_of_group
-from roadscan.condition.tasks.work import ConditionWork, plan_condition
 from roadscan.core.errors import RoadscanError
 from roadscan.core.extras import need
 from roadscan.core.survey import Survey
@@ -32,6 +20,10 @@ from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import Manifest
 from roadscan.tiles.tasks.tiles import TaskResult
 from roadscan.tiles.tasks.wanted_products import product_context
+
+if TYPE_CHECKING:
+    from roadscan.condition.tasks.tasks import P, PieceTask, S
+    from roadscan.condition.tasks.work import ConditionWork
 
 _PICTURES = 20
 """Pictures that one task draws."""
@@ -65,6 +57,18 @@ class Condition(Stage):
 
     def run(self, session: Session) -> None:
         """Compute what is missing or stale."""
+        from roadscan.condition.tasks.lines import write_lines
+        from roadscan.condition.tasks.pictures import draw_picture
+        from roadscan.condition.tasks.ravelling import patches_of_group
+        from roadscan.condition.tasks.road_edges import edges_of_pieces
+        from roadscan.condition.tasks.roughness_regions import regions_of_pieces
+        from roadscan.condition.tasks.sections import write_sections
+        from roadscan.condition.tasks.stretches import stretch_tasks, survey_stretches
+        from roadscan.condition.tasks.tasks import run_units
+        from roadscan.condition.tasks.tile_summary import write_tiles
+        from roadscan.condition.tasks.values import GroupTask, values_of_group
+        from roadscan.condition.tasks.work import plan_condition
+
         config = ConditionConfig.stated(session.survey)
         work = plan_condition(session)
         if config is None:
@@ -108,6 +112,8 @@ class Condition(Stage):
         title: str,
     ) -> None:
         """Compute pieces of roads, one to a task; none without settings."""
+        from roadscan.condition.tasks.tasks import PieceTask, run_units
+
         if settings is None:
             return
         grid, context = plan_of(session).ground.grid, product_context(plan_of(session))
@@ -116,6 +122,10 @@ class Condition(Stage):
 
     def check(self, survey: Survey) -> list[RoadscanError]:
         """Check that layers open as stated, and that a surface is made where its heights are requested."""
+        from roadscan.condition.tasks.lines import check_layer
+        from roadscan.condition.tasks.road_edges import check_edge_polygons
+        from roadscan.condition.tasks.surface_cells import check_surface_cells
+
         try:
             config = ConditionConfig.stated(survey)
             if config is not None and config.roughness_regions is not None:
@@ -131,6 +141,8 @@ class Condition(Stage):
         """Stretches and values that are there, and those that are due."""
         if not session.survey.has("condition"):
             return StageState()
+        from roadscan.condition.tasks.work import plan_condition
+
         work = plan_condition(session)
         stale = self._stale(work)
         units = len(work.stretches) + len(work.edges) + len(work.pieces) + len(work.patches)
@@ -153,7 +165,13 @@ class Condition(Stage):
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
         """Return steps of wheel paths that no road has, and quantities that no section has, by the limit missed."""
-        if not survey.has("condition") or not manifest.of(LINES):
+        if not survey.has("condition"):
+            return ()
+        from roadscan.condition.tasks.lines import LINES
+        from roadscan.condition.tasks.sections import known_sections
+        from roadscan.condition.tasks.values import value_findings
+
+        if not manifest.of(LINES):
             return ()
         told = known_sections(manifest)
         if told is None or not told[0]:

@@ -26,3 +26,11 @@ def size_in_words(size: int) -> str:
         if size >= unit:
             return f"{size / unit:,.1f} {name}"
     return f"{size:,} bytes"
+
+
+def time_in_words(seconds: float) -> str:
+    """A span of time to two units at most, such as ``3 h 20 min``."""
+    minutes = round(seconds / 60)
+    if seconds < 90:
+        return f"{max(round(seconds), 1)} s"
+    return f"{minutes // 60} h {minutes % 60:02} min" if minutes >= 60 else f"{minutes} min"

@@ -71,6 +71,8 @@ class RoadscanError(Exception):
         self.change = change or self.advice
         self.file = None if file is None else str(file)
         self.record = record
+        self.passes = ""
+        """What :func:`may_pass` said where its cause was known: a worker need not send it."""
         super().__init__(arrived, expected, change, self.file, record)
 
     def __str__(self) -> str:
@@ -108,9 +110,9 @@ class RoadscanError(Exception):
         )
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Keep the keyword parts when a worker pickles the error for the scheduler."""
+        """Keep the keyword parts, and what was noted on it, when a worker pickles the error for the scheduler."""
         state = (self.arrived, self.expected, self.change, self.file, self.record, self.missing)
-        return (_rebuild, (type(self), state))
+        return (_rebuild, (type(self), state), self.__dict__ | {"passes": may_pass(self)})
 
 
 def _rebuild(kind: type[RoadscanError], state: tuple[Any, ...]) -> RoadscanError:
@@ -129,6 +131,10 @@ class ConfigError(RoadscanError):
 
 class FormatError(RoadscanError):
     """A log cannot be read as the format it is said to be."""
+
+
+class ChangingLogError(FormatError):
+    """A log changes while it is read: its upload has not ended."""
 
 
 class TimeSystemError(RoadscanError):
@@ -155,6 +161,10 @@ class StoreError(RoadscanError):
     """The store is damaged, locked or not a roadscan store."""
 
 
+class BusyStoreError(StoreError):
+    """Another run has the store, or has taken it from this one."""
+
+
 class DamagedError(StoreError):
     """A file of the store can be read, but its content is not what was written."""
 
@@ -169,6 +179,54 @@ class AnswerError(DamagedError):
 
 class RunError(RoadscanError):
     """Some units of a run failed; the other outputs are complete and kept."""
+
+
+_OF_NETWORKS = frozenset(
+    {
+        "ConnectionError", "TimeoutError", "EndpointConnectionError", "ConnectTimeoutError", "ConnectionClosedError",
+        "ReadTimeoutError", "ClientConnectionError", "ClientPayloadError", "gaierror",
+    }
+)  # fmt: skip
+"""Classes of errors for a place that does not answer, by name: those of Python, and of botocore and aiohttp, which do
+not derive from them."""
+_NETWORK_CODES = frozenset(
+    {errno.ENETUNREACH, errno.ENETDOWN, errno.EHOSTUNREACH, errno.EHOSTDOWN, errno.ESTALE, errno.ETIMEDOUT}
+)
+"""Codes of the system for the same, a file server that was started anew (`ESTALE`) among them."""
+_LEAST_PASSING_STATUS = 500
+"""Least status of HTTP by which a server says that the fault is not in the request."""
+_OTHER_PASSING_STATUS = frozenset({408, 429})
+"""Those below it by which it asks to be asked later."""
+
+
+def may_pass(error: BaseException) -> str:
+    """Return why the same may succeed later; "" where nothing says so.
+
+    A log still changes, another run has the store, or a place does not answer. Causes of an error count as well.
+    """
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, ChangingLogError):
+            return "a log still changes"
+        if isinstance(cause, BusyStoreError):
+            return "another run has the store"
+        if _is_of_networks(cause):
+            return "a place does not answer"
+        if isinstance(cause, RoadscanError) and cause.passes:
+            return cause.passes
+        cause = cause.__cause__ or cause.__context__
+    return ""
+
+
+def _is_of_networks(error: BaseException) -> bool:
+    response = getattr(error, "response", None)  # of botocore
+    status = response.get("ResponseMetadata", {}).get("HTTPStatusCode", 0) if isinstance(response, dict) else 0
+    return (
+        status >= _LEAST_PASSING_STATUS
+        or status in _OTHER_PASSING_STATUS
+        or (isinstance(error, OSError) and error.errno in _NETWORK_CODES)
+        or not _OF_NETWORKS.isdisjoint(one.__name__ for one in type(error).__mro__)
+    )
 
 
 def in_words(error: OSError) -> RoadscanError:

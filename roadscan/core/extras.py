@@ -19,10 +19,12 @@ __all__ = ["EXTRAS", "can_draw", "cv2", "is_installed", "missing", "need", "need
 EXTRAS: Final = {
     "bokeh": ("bokeh", "dashboard"),
     "cv2": ("opencv-python-headless", "opencv"),
+    "dask_gateway": ("dask-gateway", "gateway"),
     "geopandas": ("geopandas", "frames"),
     "kiss_icp.kiss_icp": ("kiss-icp", "odometry"),
     "matplotlib": ("matplotlib", "pictures"),
     "onnxruntime": ("onnxruntime", "onnx"),
+    "opentelemetry.sdk.trace": ("opentelemetry-sdk", "otel"),
     "psycopg": ("psycopg", "postgis"),
     "rapidocr": ("rapidocr", "ocr"),
     "lz4.frame": ("lz4", "ros"),

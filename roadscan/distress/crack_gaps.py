@@ -13,7 +13,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from roadscan.distress.cracks import CrackPiece
 
@@ -36,6 +35,8 @@ def outwards(line_m: Float64) -> Float64:
 
 def bridges_of(pieces: Sequence[CrackPiece], bridge_m: float, cell_m: float) -> list[CrackPiece]:
     """Returns pieces that join free ends of other pieces; the order of `pieces` does not matter."""
+    from scipy.spatial import cKDTree
+
     met: dict[tuple[int, int], int] = {}
     for name in (name for one in pieces for name in (one.start, one.end)):
         met[name] = met.get(name, 0) + 1

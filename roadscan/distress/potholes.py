@@ -22,8 +22,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import shapely
-from rasterio.features import shapes
-from scipy.ndimage import label
 
 from roadscan.core.extras import cv2
 from roadscan.distress.hole_blocks import Blocks, block_cells, blocks_around
@@ -229,6 +227,9 @@ def _thin_cells(cell_m: float) -> int:
 def _pieces(
     window: HeightWindow, low: Bool, depth_m: Float64, hidden: Bool, block_depth_m: Float64, edge_depth_m: float
 ) -> list[PotholePiece]:
+    from rasterio.features import shapes
+    from scipy.ndimage import label
+
     numbers, count = label(low)
     if not count:
         return []

@@ -174,7 +174,7 @@ class OpenSurvey:
         Its statements reach the store and memory; `unconfined` lets them read and write any file.
         """
         from roadscan.navigation.tasks.navigate import known_keys
-        from roadscan.store.sql import connect
+        from roadscan.store.query.sql import connect
 
         return connect(self.store, known_keys(self.survey, self.store), unconfined=unconfined)
 
@@ -191,7 +191,7 @@ class OpenSurvey:
         """
         import duckdb
 
-        from roadscan.store.sql import missing_table
+        from roadscan.store.query.sql import missing_table
         from roadscan.survey.ask import not_made
 
         try:
@@ -243,8 +243,8 @@ class OpenSurvey:
         where = [f"{c} = '{_quoted(v)}'" for c, v in (("run", run), ("sensor", sensor)) if v is not None]
         source = f'"{name}"'
         if start is not None or end is not None:
-            first = _gps_ns(start) if start is not None else 0
-            last = _gps_ns(end) - 1 if end is not None else 2**62
+            first = gps_ns_of(start) if start is not None else 0
+            last = gps_ns_of(end) - 1 if end is not None else 2**62
             if last < first - 1:
                 raise ConfigError(f"the span ends ({end}) before it starts ({start})", expected="start before end")
             source = f"{name}_between({first}, {last})"
@@ -278,7 +278,7 @@ class OpenSurvey:
         from roadscan.door.extracts import poses_on_map
 
         self._check_run(run)
-        limits = (_gps_ns(start) if start is not None else None, _gps_ns(end) if end is not None else None)
+        limits = (gps_ns_of(start) if start is not None else None, gps_ns_of(end) if end is not None else None)
         return poses_on_map(self.session, run, *limits)
 
     def cells(self, *, bbox: Box | None = None, tile: str | None = None) -> xr.Dataset:
@@ -572,7 +572,14 @@ def _clock(stated: Clock | Mapping[str, Any] | str | None) -> Clock | None:
     return ClockConfig.parse(dict(stated)).clock()
 
 
-def _gps_ns(instant: Instant) -> int:
+def gps_ns_of(instant: Instant) -> int:
+    """Return an instant in GPS nanoseconds.
+
+    Raises
+    ------
+    ConfigError
+        where it is none, or has no zone.
+    """
     from roadscan.core.gpstime import gps_ns_from_utc
 
     if isinstance(instant, int | np.integer):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from roadscan.core.errors import FormatError, FullDiskError, RoadscanError, RunError, StoreError
+from roadscan.core.errors import ChangingLogError, FormatError, FullDiskError, RoadscanError, RunError, StoreError
 from roadscan.core.gpstime import TimeSystem
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
@@ -29,6 +29,7 @@ from roadscan.ingest.sources import stamp_of
 from roadscan.ingest.stray_points import CloudPoints
 from roadscan.run.engine.compute import Compute, Done, Inline
 from roadscan.run.session import Session, found_once
+from roadscan.run.telling.teller import in_this_process
 from roadscan.store.logs import (
     DataFile,
     LogRecord,
@@ -65,6 +66,11 @@ class IngestTask:
     log: PlannedLog
     replaces: tuple[LogRecord, ...] = ()
     """Earlier records of the same bytes under other settings; no two tasks replace the same one."""
+
+    @property
+    def units(self) -> tuple[str]:
+        """Name of the log."""
+        return (self.log.source.path.name,)
 
 
 def ingest(
@@ -187,7 +193,9 @@ def _check_unchanged(log: PlannedLog) -> None:
     except OSError:
         same = False
     if not same:
-        raise FormatError("the log changed while it was read", change="run again when its upload has ended", file=path)
+        raise ChangingLogError(
+            "the log changed while it was read", change="run again when its upload has ended", file=path
+        )
 
 
 def survey_records(survey: Survey, store: Store, logs: Logs | None = None) -> list[LogRecord]:
@@ -226,7 +234,9 @@ def _ingested(
     """Yield the result of each task, in their order; logs in the store (`held` keys) are not sent to workers."""
     missing = [t for t in tasks if t.log.key not in held]
     if len(missing) < 2 or sum(t.log.bytes for t in missing) < _SMALL_BYTES:
-        yield from Inline().map(ingest_log, tasks)
+        here = in_this_process(compute)
+        for task in tasks:
+            yield from (Inline() if task.log.key in held else here).map(ingest_log, [task])
         return
     arriving = compute.map(ingest_log, sorted(missing, key=lambda t: -t.log.bytes))
     arrived: dict[str, Done[IngestTask, IngestResult]] = {}

@@ -17,7 +17,6 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
-import scipy.special
 import shapely
 
 from roadscan.core.errors import ConfigError, nearest
@@ -223,6 +222,8 @@ def _compare_places(pair: _Pair, unit_m: float, compared: _Compared) -> None:
 
 
 def _compare_values(pair: _Pair, compared: _Compared) -> None:
+    import scipy.special
+
     for column in asset_schema(pair.kind).own:
         if column.is_evidence:
             continue

@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 import shapely
-from scipy.spatial import cKDTree
 
 from roadscan.assets.object_table import object_names
 from roadscan.assets.tasks.along_roads import along_roads
@@ -116,6 +115,8 @@ class Ground:
 
         Where a tile has no readings, the height of the nearest other place that has one is used.
         """
+        from scipy.spatial import cKDTree
+
         out = np.full(len(places_m), np.nan)
         for tile, own, pixel in self._by_tile(places_m):
             level = self._level(tile)

@@ -13,7 +13,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-import scipy.sparse
 import shapely
 
 from roadscan.inventory.settings import Matching
@@ -202,6 +201,8 @@ def _size_difference(known: Floats, found: Floats, pairs: Pairs) -> Floats:
 
 def _assign(pairs: Pairs, result: Ints) -> None:
     """Choose pairs, one to one: as many as possible, with the least sum of costs."""
+    import scipy.sparse
+
     if not pairs.known.size:
         return
     known, a = np.unique(pairs.known, return_inverse=True)

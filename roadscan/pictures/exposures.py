@@ -10,7 +10,6 @@ from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from roadscan.calibrate.resection import SENSOR_FROM_OPENCV
 from roadscan.core.camera import Interior
@@ -174,6 +173,8 @@ def _motion(
     plan: SurveyPlan, source: TrajectorySource, epochs_gps_ns: Int64
 ) -> tuple[Bool, Float64, Float64, Float64, Float64]:
     """Returns whether there is a pose at epochs (n,) in order, position, attitude, velocity and turning rate."""
+    from scipy.spatial.transform import Rotation
+
     n = epochs_gps_ns.size
     found, body, turned = np.zeros(n, bool), np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)
     velocity, rate = np.full((n, 3), np.nan), np.full((n, 3), np.nan)

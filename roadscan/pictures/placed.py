@@ -12,7 +12,6 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import shapely
-from scipy.spatial.transform import Rotation
 
 from roadscan.calibrate.resection import SENSOR_FROM_OPENCV
 from roadscan.core.crs import MapFrame
@@ -340,6 +339,8 @@ def _row_motion(
 
     exposed : trajectory, epochs (n,) of the middle rows, and mountings.
     """
+    from scipy.spatial.transform import Rotation
+
     source, epochs, mountings = exposed
     motion = np.zeros((epochs.size, 6))
     if camera.interior is None or not (each_ns := row_ns(camera.interior, change)):

@@ -7,7 +7,6 @@ from typing import Final, Self
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from roadscan.core.rig import Mounting, Mountings
 
@@ -76,6 +75,8 @@ class MountingChange:
         )
 
     def _one(self, mounting: Mounting, *, parallel: bool) -> Mounting:
+        from scipy.spatial.transform import Rotation
+
         rotation, lever = mounting.arrays()
         turned = Rotation.from_rotvec(self.turn_rad).as_matrix() @ rotation
         turned *= 1.0 + self.range_scale * np.array([0.0, 0.0, 1.0] if parallel else [1.0, 1.0, 1.0])

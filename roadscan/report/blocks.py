@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Final
 
 MOST_ROWS: Final = 60
-"""Most rows of a table: a longer one is cut, and says so."""
+"""Most rows of a table, where it states no other number: a longer one is cut, and says so."""
 
 
 @dataclass(frozen=True)
@@ -34,16 +34,18 @@ class Table:
     full_table: str = ""
     """Name of the SQL table with all rows, where the page may show only some of them."""
     numbers: bool = True
+    most_rows: int = MOST_ROWS
+    """Most rows that the page shows."""
 
     @property
     def shown(self) -> Sequence[Sequence[str]]:
         """Rows that the page shows."""
-        return self.rows[:MOST_ROWS]
+        return self.rows[: self.most_rows]
 
     @property
     def left_out(self) -> int:
         """Number of rows that it does not show."""
-        return max(len(self.rows) - MOST_ROWS, 0)
+        return max(len(self.rows) - self.most_rows, 0)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Final
@@ -39,35 +40,43 @@ def report_page(session: Session) -> str:
     return _made(session)[0]
 
 
-def _made(session: Session) -> tuple[str, bool]:
-    """Return the report, and whether all its sections could be made."""
+def _made(session: Session) -> tuple[str, list[str]]:
+    """Return the report, and why sections of it could not be made, in words."""
     config, failed = session.survey.config, list[str]()
     material = Material(session)
     parts = [part for part in (_part(section, material, failed) for section in sections()) if part.blocks]
+    lead = (
+        f"Report of the survey {config.id}. Lengths are in metres unless a unit is named; σ is one standard "
+        "deviation; times are UTC."
+    )
+    made_of = "the records and tables of the survey's store"
+    return html_page(f"{config.id}: report of the survey", config.title or config.id, lead, parts, made_of), failed
+
+
+def html_page(title: str, heading: str, lead: str, parts: Sequence[Part], made_of: str) -> str:
+    """Return parts as a self-contained page.
+
+    title : of the browser's window; heading, lead : what stands first; made_of : what the page follows from, in words.
+    """
     template = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     ).from_string(files(__package__).joinpath("page.html").read_text(encoding="utf-8"))
-    page = template.render(
-        title=f"{config.id}: report of the survey",
-        heading=config.title or config.id,
-        lead=f"Report of the survey {config.id}. Lengths are in metres unless a unit is named; σ is one standard "
-        "deviation; times are UTC.",
-        parts=parts,
-        footer=f"Made by roadscan {__version__} from the records and tables of the survey's store.",
-    )
-    return page, not failed
+    footer = f"Made by roadscan {__version__} from {made_of}."
+    return template.render(title=title, heading=heading, lead=lead, parts=parts, footer=footer)
 
 
 def keep_report(session: Session) -> str:
     """Write the report if what it is made of changed; return its path relative to the survey's root."""
     manifest, key = session.manifest, _key(session)
     if not manifest.is_current(REPORT, REPORT, key):
-        page, is_whole = _made(session)
+        page, failed = _made(session)
+        for words in failed:
+            session.note(f"the report lacks a section: {words}")
 
         def write(file: Path) -> None:
             file.write_bytes(page.encode("utf-8"))
 
-        keep_file(session.store, manifest, (REPORT, REPORT), key if is_whole else _NOT_WHOLE, PATH, write)
+        keep_file(session.store, manifest, (REPORT, REPORT), _NOT_WHOLE if failed else key, PATH, write)
     return PATH
 
 
@@ -93,10 +102,10 @@ def _key(session: Session) -> str:
 
 
 def _part(section: Section, material: Material, failed: list[str]) -> Part:
-    """Return a section of the report; where it cannot be made, its name joins `failed`."""
+    """Return a section of the report; where it cannot be made, `failed` gets its title and why."""
     try:
         return Part(section.name, section.title, tuple(section.blocks(material)))
     except RoadscanError as error:
-        failed.append(section.name)
+        failed.append(f"{section.title}: {error}")
         told = Paragraph(f"This section could not be made: {error}", is_warning=True)
         return Part(section.name, section.title, (told,))

@@ -8,10 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self, TypeVar, cast
 
-from roadscan.core.errors import StoreError
+from roadscan.core.errors import StoreError, may_pass
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Compute, Inline
 from roadscan.run.selection import Selection
+from roadscan.run.telling.teller import Teller
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
 
@@ -38,8 +39,12 @@ class Session:
     selection: Selection | None = None
     """If given, only these tiles are computed, even if they are current."""
     reporter: Reporter = field(default_factory=Reporter)
+    teller: Teller | None = None
+    """Tells those who listen what the run does, while it is at work."""
     failures: list[tuple[str, str, str]] = field(default_factory=list)
     """Stage, unit and reason of everything that failed."""
+    passes: str = ""
+    """Why one of them may pass by itself, empty where nothing says so."""
     raw_bytes_read: int = 0
     """Compressed bytes of readings that the tiles stage requested."""
     stage: str = ""
@@ -113,6 +118,8 @@ class Session:
         for unit, reason in found:
             if (unit, str(reason)) not in known:  # what an earlier stage found applies to all later stages
                 self.failures.append((stage, unit, str(reason)))
+                why = may_pass(reason) if isinstance(reason, BaseException) else getattr(reason, "passes", "")
+                self.passes = self.passes or why
                 self.reporter.line(f"failed: {stage} {unit}: {reason}")
 
     def bar(self, what: str) -> Callable[[int, int], None]:

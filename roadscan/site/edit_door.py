@@ -18,8 +18,10 @@ class EditDoor:
         self._open = open_session
         self._alone = threading.Lock()
 
-    def take(self, content: bytes) -> dict[str, Any]:
+    def take(self, content: bytes, who: str = "") -> dict[str, Any]:
         """Apply all sound edits of a document; the answer has the result of each, in the order of the document.
+
+        who : their author, as a proxy told it; "" where the document itself says who edited.
 
         Raises
         ------
@@ -28,7 +30,7 @@ class EditDoor:
         """
         with self._alone:
             session = self._open()
-            document: PageDocument = page_document(session, "the page", content)
+            document: PageDocument = page_document(session, "the page", content).by(who)
             pulled, outcomes = truth_of(session).pull_page(document, sound=True)
         told = [one._asdict() for one in outcomes]
         return {"commit": pulled.commit, "edits": told, "conflicts": pulled.conflicts}

@@ -61,7 +61,7 @@ class MeasuringDoor:
         self._session: Session | None = None
         self._clicked = ClickedPoints(site.material.session.survey.folder / FILE)
 
-    def measure(self, content: bytes) -> dict[str, Any]:
+    def measure(self, content: bytes, _who: str = "") -> dict[str, Any]:
         """Return the places that pixels show, with their σ, as `roadscan where --picture` does.
 
         Raises
@@ -92,7 +92,7 @@ class MeasuringDoor:
                 "geojson": geojson_of(measured, poses_plan_of(session).ground.map) if kept else None,
             }  # fmt: skip
 
-    def control(self, content: bytes) -> dict[str, Any]:
+    def control(self, content: bytes, _who: str = "") -> dict[str, Any]:
         """Return control points and what is measured of them, after a measurement was written where one is.
 
         Raises

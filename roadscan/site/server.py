@@ -3,7 +3,8 @@
 It listens on a loopback address. It answers GET and HEAD, whole or by one range (RFC 9110, 14), for paths that the site
 names; no path reaches the file system. A request that names another host is refused, so that no page of another origin
 reads the survey by a name that resolves to this machine. Where it has doors, it answers POST from its own page: what
-changes nothing as it is, and what writes with a token that stands in no document.
+changes nothing as it is, and what writes with a token that stands in no document. Behind a proxy (`access.py`), it
+answers only those whom the file of access names.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from urllib.parse import unquote, urlsplit
 
 from roadscan import __version__
 from roadscan.core.errors import RoadscanError
+from roadscan.site.access import Access, Asker, secret_of_proxy
 from roadscan.site.document import json_bytes
 from roadscan.site.live import Served
 from roadscan.site.site import REPORT_PAGE
@@ -54,6 +56,8 @@ _TYPES: Final = {
 _PATH: Final = re.compile(r"/([A-Za-z0-9_-][A-Za-z0-9_.-]*(?:/[A-Za-z0-9_-][A-Za-z0-9_.-]*)*)?")
 _RANGE: Final = re.compile(r"bytes=(\d{0,18})-(\d{0,18})")
 _LONGEST_HEAD: Final = 8192  # longer paths are refused
+EDIT: Final = "/edit"
+"""Where an editor behind a proxy asks for the page that edits."""
 TOKEN_HEADER: Final = "X-Roadscan-Edit"
 """Header with the token, which a page of another origin can only send with this server's permission."""
 _MOST_POSTED_BYTES: Final = 16_000_000  # larger documents are refused
@@ -71,7 +75,8 @@ class Documents(Protocol):
 class Door(NamedTuple):
     """What answers documents that the page posts at a path."""
 
-    answer: Callable[[bytes], Any]
+    answer: Callable[[bytes, str], Any]
+    """Takes a document and who sent it: "" for the person at this machine."""
     writes: bool
     """Whether it changes files: the token is asked for."""
 
@@ -82,11 +87,15 @@ class SiteServer(ThreadingHTTPServer):
     daemon_threads = True
     allow_reuse_address = False
 
-    def __init__(self, documents: Documents, port: int = 0, doors: Mapping[str, Door] | None = None) -> None:
-        """Listen on a port; 0 selects a free one. Doors are named by their paths."""
-        self.documents, self.doors = documents, doors or {}
+    def __init__(
+        self, documents: Documents, port: int = 0, doors: Mapping[str, Door] | None = None,
+        access: Access | None = None,
+    ) -> None:  # fmt: skip
+        """Listen on a port; 0 selects a free one. Doors are named by their paths; a page behind a proxy has access."""
+        self.documents, self.doors, self.access = documents, doors or {}, access
+        self.secret = "" if access is None else secret_of_proxy()
         self.token = secrets.token_urlsafe(24) if any(door.writes for door in self.doors.values()) else ""
-        super().__init__((LOOPBACK, port), _Handler)
+        super().__init__((LOOPBACK if access is None else access.listen, port), _Handler)
 
     def handle_error(self, request: object, client_address: object) -> None:
         """Ignore a browser that closed the connection early; report all other errors."""
@@ -96,11 +105,13 @@ class SiteServer(ThreadingHTTPServer):
     @property
     def address(self) -> str:
         """Address of the page with the token of edits after `#`, which browsers send to no server."""
+        if self.access is not None:
+            return self.access.address  # editors get their token there
         return f"http://{LOOPBACK}:{self.server_port}/" + (f"#edit={self.token}" if self.token else "")
 
     @property
     def hosts(self) -> frozenset[str]:
-        """Host names that requests may use."""
+        """Host names that requests may use where no proxy stands before the server."""
         return frozenset(f"{name}:{self.server_port}" for name in (LOOPBACK, "localhost"))
 
 
@@ -112,7 +123,10 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = 60
 
     def do_GET(self) -> None:
-        """Answer with a document or a part of it."""
+        """Answer with a document or a part of it; an editor who asks for `/edit` is sent to the page that edits."""
+        if self.server.access is not None and self.path == EDIT and (asker := self._asker()) and asker.role == "editor":
+            self._head(HTTPStatus.SEE_OTHER, "", {"Location": f"/#edit={self.server.token}", "Content-Length": "0"})
+            return
         self._answer(with_body=True)
 
     def do_HEAD(self) -> None:
@@ -126,27 +140,60 @@ class _Handler(BaseHTTPRequestHandler):
         if door is None:
             self._refuse_method()
             return
-        refused = self._refused(door)
+        asker = self._asker()
+        audit = self.server.access if door.writes else None
+        try:
+            refused = self._refused(door, asker)
+            if audit is not None:
+                audit.note(asker, self.path, "received" if refused is None else f"refused: {refused[1]}")
+        except RoadscanError as error:
+            self._text(HTTPStatus.INTERNAL_SERVER_ERROR, f"the audit cannot be kept: {error}")
+            return
         if refused is not None:
             self._text(*refused)
             return
+        content = self.rfile.read(int(self.headers["Content-Length"]))
         try:
-            answer = door.answer(self.rfile.read(int(self.headers["Content-Length"])))
+            answer = door.answer(content, asker.name if asker else "")
         except RoadscanError as error:
+            self._told(audit, asker, f"refused: {error}")
             self._text(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
             return
-        content = json_bytes(answer)
-        self._head(HTTPStatus.OK, "answer.json", {"Content-Length": str(len(content))})
-        self.wfile.write(content)
+        commit = answer.get("commit")
+        self._told(audit, asker, "taken" if commit is None else f"taken: commit {commit}")
+        told = json_bytes(answer)
+        self._head(HTTPStatus.OK, "answer.json", {"Content-Length": str(len(told))})
+        self.wfile.write(told)
 
-    def _refused(self, door: Door) -> tuple[HTTPStatus, str] | None:
+    def _asker(self) -> Asker | None:
+        """Return who asks; None where they may see nothing. Without a proxy it is the person at this machine."""
+        if self.server.access is None:
+            named = self.headers.get_all("Host", []) in [[host] for host in self.server.hosts]
+            return Asker("", "editor") if named else None
+        return self.server.access.asker(self.headers, self.server.secret)
+
+    def _told(self, audit: Access | None, asker: Asker | None, outcome: str) -> None:
+        """Tell the audit what became of a document, and standard error where the audit cannot be written any more."""
+        try:
+            if audit is not None:
+                audit.note(asker, self.path, outcome)
+        except RoadscanError as error:
+            sys.stderr.write(f"roadscan: the audit cannot be kept: {error}; {outcome}\n")
+
+    def _refused(self, door: Door, asker: Asker | None) -> tuple[HTTPStatus, str] | None:
         """Return why a document is refused; None where it comes from this server's page."""
-        host, origin = self.headers.get_all("Host", []), self.headers.get_all("Origin", [])
-        if host not in [[one] for one in self.server.hosts] or origin != [f"http://{host[0]}"]:
+        access = self.server.access
+        origin = f"http://{self.headers.get('Host', '')}" if access is None else access.origin
+        if asker is None or self.headers.get_all("Origin", []) != [origin]:
             return HTTPStatus.FORBIDDEN, "documents are taken from this server's own page alone"
+        if door.writes and asker.role != "editor":
+            return HTTPStatus.FORBIDDEN, f"'{asker.name}' may look at this page, and not edit it"
         token = self.headers.get(TOKEN_HEADER, "").encode("utf-8", "replace")
         if door.writes and not hmac.compare_digest(token, self.server.token.encode()):
-            return HTTPStatus.FORBIDDEN, "open the page by the address that roadscan printed: it allows edits"
+            return (
+                HTTPStatus.FORBIDDEN,
+                f"open the page by the address that roadscan printed, or by {EDIT}: it allows edits",
+            )
         if self.headers.get_content_type() not in _POSTED:
             return HTTPStatus.UNSUPPORTED_MEDIA_TYPE, f"documents come as {' or '.join(_POSTED)}"
         length = self.headers.get("Content-Length", "")
@@ -170,8 +217,11 @@ class _Handler(BaseHTTPRequestHandler):
         self._text(HTTPStatus.METHOD_NOT_ALLOWED, told, {"Allow": "GET, HEAD"})
 
     def _answer(self, *, with_body: bool) -> None:
-        if self.headers.get_all("Host", []) not in [[host] for host in self.server.hosts]:
-            self._text(HTTPStatus.MISDIRECTED_REQUEST, "ask for the address that roadscan printed", with_body=with_body)
+        if self._asker() is None:
+            told = (HTTPStatus.MISDIRECTED_REQUEST, "ask for the address that roadscan printed")
+            if self.server.access is not None:
+                told = (HTTPStatus.FORBIDDEN, "the file of access does not name you, or this is not the proxy's way")
+            self._text(*told, with_body=with_body)
             return
         path = unquote(urlsplit(self.path).path, errors="replace") if len(self.path) < _LONGEST_HEAD else ""
         found = _PATH.fullmatch(path)

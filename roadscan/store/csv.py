@@ -1,4 +1,4 @@
-"""Writes tables as comma-separated values for scripts."""
+"""Writes tables as comma-separated values, or as JSON, for scripts."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import base64
 import datetime as dt
 import decimal
 import json
+import math
 from typing import Any, BinaryIO
 
 import pyarrow as pa
@@ -22,6 +23,20 @@ def write_csv(table: pa.Table, out: BinaryIO) -> None:
     """
     columns = [_plain(column) for column in table.columns]
     pyarrow.csv.write_csv(pa.Table.from_arrays(columns, names=table.column_names), out, _STYLE)
+
+
+def write_json(table: pa.Table, out: BinaryIO) -> None:
+    """Write a table as a JSON list of objects; values as in CSV, numbers that are none (NaN, infinity) as null."""
+    rows = [{name: _finite(value) for name, value in row.items()} for row in table.to_pylist()]
+    out.write((json.dumps(rows, indent=1, ensure_ascii=False, default=_unusual, allow_nan=False) + "\n").encode())
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {str(name): _finite(one) for name, one in value.items()}
+    return [_finite(one) for one in value] if isinstance(value, list) else value
 
 
 def _plain(column: pa.ChunkedArray) -> pa.ChunkedArray:

@@ -312,6 +312,11 @@ def read_recorded(store: Store, record: OutputRecord) -> bytes:
     return content
 
 
+def is_changing(store: Store) -> bool:
+    """Return whether a run is at work, or ended before all was done."""
+    return store.exists(_CHANGING)
+
+
 def begin_changes(store: Store, *, older: bool = False) -> bool:
     """Note that the store may contain unrecorded files from now on; return True where that was already noted.
 

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.core.errors import StoreError
+from roadscan.core.errors import StoreError, may_pass
 from roadscan.core.gpstime import iso_from_gps_ns
 from roadscan.store.checked_json import checked_json, parse_checked
 from roadscan.store.damage import UNREADABLE
@@ -40,6 +40,11 @@ class Lost:
     """Path of the damaged file that was set aside; empty where it was missing."""
     accepted: bool = False
     """True once the user accepted that the store continues without them."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as JSON values."""
+        told = {"file": self.file.path, "table": self.table, "rows": self.rows, "accepted": self.accepted}
+        return {**told, "told": self.told}
 
     def __str__(self) -> str:
         """Return in words what is lost."""
@@ -97,7 +102,9 @@ def _sound_groups(store: Store, table: str, file: DataFile) -> list[pa.Table | N
         opened = pq.ParquetFile(pa.BufferReader(store.read_bytes(file.path)), page_checksum_verification=True)
         if opened.num_row_groups != len(none):
             return none
-    except (*UNREADABLE, StoreError):
+    except (*UNREADABLE, StoreError) as error:
+        if may_pass(error):  # the rows are not lost because a place does not answer
+            raise
         return none
     return [_sound_group(opened, number, table, file) for number in range(len(none))]
 

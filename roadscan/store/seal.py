@@ -44,6 +44,11 @@ def sealed_parquet(table: pa.Table, **settings: Any) -> bytes:
     return _with(content, place, bytes_digest(content))
 
 
+def bears_seal(content: bytes) -> bool:
+    """Return whether a file bears a seal, which may hold or not."""
+    return bool(_place(content).start >= 0)
+
+
 def check_seal(content: bytes) -> None:
     """Raise ValueError where a file bears a seal that does not hold, or whose name is damaged; others pass."""
     place = _place(content)

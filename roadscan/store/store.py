@@ -60,6 +60,19 @@ MADE_AGAIN: Final = "run `roadscan verify`, which finds all such files; the next
 
 _T = TypeVar("_T")
 
+_PUT: Final = [0]
+"""Bytes of the files that this process has published."""
+
+
+def count_put(size: int) -> None:
+    """Count bytes that this process has published."""
+    _PUT[0] += size
+
+
+def bytes_put() -> int:
+    """Return the bytes of all files that this process has published in stores so far."""
+    return _PUT[0]
+
 
 class Store:
     """Location of one survey's store; cheap to create, and safe to send to a worker."""
@@ -216,6 +229,7 @@ class Store:
         """Move a finished local file into the store under its final name, durably if it is `lasting`."""
         self._check_lease()
         target = self.path(relative)
+        count_put(local.stat().st_size)
         if self.is_folder:
             try:
                 _made(Path(target).parent, lambda: local.replace(target), lasting)
@@ -468,6 +482,24 @@ def opened_url(url: str) -> tuple[Any, str]:
         return opened
     folders = fsspec.filesystem("file")
     return folders, folders._strip_protocol(url)
+
+
+def put_file(fs: Any, path: str, content: bytes) -> None:
+    """Write a small file that belongs to no survey, whole or not at all; one that has this content stays as it is."""
+    with _in_words(path):
+        if fs.exists(path) and bytes(fs.cat_file(path)) == content:
+            return
+        if "file" not in fs.protocol and "local" not in fs.protocol:
+            fs.pipe_file(path, content)
+            return
+        target = Path(path)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        temporary = target.with_name(f".{os.getpid()}-{uuid.uuid4().hex}")
+        try:
+            temporary.write_bytes(content)
+            temporary.replace(target)
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

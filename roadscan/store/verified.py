@@ -21,11 +21,12 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from roadscan.core.errors import AnswerError, StoreError
+from roadscan.store.history import history_faults
 from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import Manifest
 from roadscan.store.repair_records import fault_of
 from roadscan.store.small_tables import REPAIR_HINT, read_small, small_path, small_records
-from roadscan.store.sql_files import Stamp, stamp_of
+from roadscan.store.stamp import Stamp, stamp_of
 from roadscan.store.store import MADE_AGAIN, Store
 
 _FILE: Final = "manifest/verified.parquet"
@@ -59,6 +60,7 @@ def faults_of_opened(store: Store, opened: Mapping[str, Stamp], recorded: pa.Tab
     paths = sorted(opened)
     records, notes = _looked_up(paths, recorded), _looked_up(paths, _read(store))
     faults = {p: _fault_of_held(store, p) for p in _held_of(paths) if p not in records}
+    faults.update(history_faults(store, paths))
     due: list[str] = []
     for path in paths:
         record, stamp = records.get(path), opened[path]
@@ -147,6 +149,8 @@ def _with_way_out(path: str, fault: str | None) -> str | None:
 
 
 def _in_answer(path: str, fault: str) -> AnswerError:
+    if path.startswith("manifest/history/"):
+        return AnswerError(f"the answer is made of a damaged file: {fault}")
     ingested = "/log=" in path and not path.startswith("tables/footprints/")
     change = "" if _held_of([path]) else "`roadscan verify --repair` reads its log again" if ingested else MADE_AGAIN
     return AnswerError(f"the answer is made of a damaged file: {fault}", change=change)

@@ -17,8 +17,6 @@ import pyarrow.parquet as pq
 
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.witness import Finding
-from roadscan.store.codecs.parquet.list_table import is_list_table, write_list_table
-from roadscan.store.codecs.parquet.number_table import is_number_table, write_number_table
 from roadscan.store.derived import with_derived
 from roadscan.store.digest import file_digest
 from roadscan.store.logs import DataFile, log_folder
@@ -26,7 +24,7 @@ from roadscan.store.merge import merged
 from roadscan.store.readings.packed_returns import PACKED, as_returns, stored_columns, write_packed_returns
 from roadscan.store.row_order import sorted_batch, sorted_rows
 from roadscan.store.schema import TableSchema, table_schema
-from roadscan.store.store import Store
+from roadscan.store.store import Store, count_put
 
 BUDGET_BYTES: Final = 128 << 20
 """Bytes of rows in memory before the fullest partitions are written."""
@@ -151,6 +149,7 @@ class LogWriter:
         out = self.files(run, sensor, key)
         for table in {t for t, _ in self._bins}:
             store.publish_folder(self._folder / table, log_folder(table, run, sensor, key))
+        count_put(sum(file.bytes for own in out.values() for file in own.values()))
         return {table: tuple(files.values()) for table, files in out.items()}
 
     def files(self, run: str, sensor: str, key: str) -> dict[str, dict[Path, DataFile]]:
@@ -208,6 +207,9 @@ def write_parquet(path: Path, rows: pa.Table, schema: TableSchema) -> None:
     if schema.name == PACKED:
         write_packed_returns(path, rows, schema.row_group_rows)
         return
+    from roadscan.store.codecs.parquet.list_table import is_list_table, write_list_table
+    from roadscan.store.codecs.parquet.number_table import is_number_table, write_number_table
+
     if is_list_table(rows.schema):
         write_list_table(path, rows, schema.row_group_rows)
         return

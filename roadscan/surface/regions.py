@@ -21,7 +21,6 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 import shapely
-from scipy.ndimage import binary_dilation, find_objects, label, uniform_filter1d
 
 from roadscan.surface.coarse import CoarseModel
 from roadscan.surface.kernels.coarse import PATCH_SUMS, sum_patches
@@ -72,6 +71,8 @@ def stated_regions(polygons: Iterable[npt.ArrayLike]) -> list[Region]:
 
 def find_regions(model: CoarseModel, settings: RegionSettings) -> list[Region]:
     """Returns regions where the coarse model varies in depth, in the order of the drive."""
+    from scipy.ndimage import binary_dilation, find_objects, label
+
     if not model.height_m.size or model.along_m[0] == model.along_m[-1]:
         return []  # a vehicle that stood still gives one line
     patches = _Patches.of(model, settings.patch_m)
@@ -120,6 +121,8 @@ class _Patches:
 
     def roughness_m(self, surface_m: Float64, level_patches: int) -> Float64:
         """Returns the RMS (rows, columns) of a surface's heights about the plane around each patch (m), or NaN."""
+        from scipy.ndimage import uniform_filter1d
+
         sums = np.zeros((*self.shape, PATCH_SUMS))
         sum_patches(
             self.model.along_m, surface_m, self.model.first_node, self.model.settings.spacing_m, self.edge_m,

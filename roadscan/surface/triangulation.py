@@ -19,7 +19,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import Delaunay, QhullError
 
 from roadscan.surface.kernels.delaunay import flip_edges
 from roadscan.surface.sites import Sites
@@ -93,6 +92,8 @@ def _paired(triangles: npt.NDArray[np.int64], across: npt.NDArray[np.int64]) -> 
 
 def _qhull(sites: Sites) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
     """Returns triangles and neighbours from Qhull; None where all points are collinear."""
+    from scipy.spatial import Delaunay, QhullError
+
     if len(sites) < 3:
         return None
     places = np.stack(sites.local_m(), axis=1) + _nudges(sites)

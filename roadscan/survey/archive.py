@@ -25,6 +25,7 @@ from roadscan.store.checked_json import checked_json, parse_checked
 from roadscan.store.digest import file_digest, stream_digest
 from roadscan.store.logs import has_log
 from roadscan.store.store import opened_url
+from roadscan.survey.forgotten import forgotten_pictures
 
 LIST: Final = "archive.json"
 """List of an archive's files, in its root."""
@@ -158,7 +159,7 @@ def archive(
     listed = _listed(kept)
     for number, (file, ingested) in enumerate(wanted.items(), 1):
         name, digest = listed_name(file, folder), ingested or file_digest(file)
-        place = _place(name)
+        place = archive_place(name)
         known, size = listed.get(place), file.stat().st_size
         if known and known["digest"] == digest and kept.size(place) == known["bytes"] == size:
             done.there.append(name)
@@ -177,6 +178,7 @@ def archive(
 def check_archive(session: Session, url: str, report: Callable[[int, int], None] = lambda _a, _b: None) -> Archived:
     """Read every file of an archive, and compare it with the list."""
     kept, done = Archive.of(url, session), Archived()
+    gone = {one.path for one in forgotten_pictures(session.store)}
     files = kept.files()
     if not files:
         raise StoreError(
@@ -184,7 +186,11 @@ def check_archive(session: Session, url: str, report: Callable[[int, int], None]
         )
     for number, (place, of) in enumerate(files.items(), 1):
         found = kept.digest(place)
-        if found == of["digest"]:
+        if of["path"] in gone and found:
+            done.faults.append(
+                f"{place}: it is among the forgotten pictures; `roadscan forget --archive` removes it here"
+            )
+        elif found == of["digest"]:
             done.there.append(of["path"])
         else:
             done.faults.append(f"{place}: {'its bytes are others' if found else 'it is not there'}")
@@ -193,12 +199,18 @@ def check_archive(session: Session, url: str, report: Callable[[int, int], None]
 
 
 def restore(session: Session, url: str, report: Callable[[int, int], None] = lambda _a, _b: None) -> Archived:
-    """Copy files that are not at their places back from an archive; those that are there stay as they are."""
+    """Copy files that are not at their places back from an archive; those that are there stay as they are.
+
+    Pictures that were forgotten stay where they are, and count as faults of the archive.
+    """
     kept, done = Archive.of(url, session), Archived()
+    gone = {one.path for one in forgotten_pictures(session.store)}
     files = kept.files()
     for number, (place, of) in enumerate(files.items(), 1):
         file = session.survey.resolve(Path(of["path"]))
-        if file.exists():
+        if of["path"] in gone:
+            done.faults.append(f"{place}: it is among the forgotten pictures; nothing was restored of it")
+        elif file.exists():
             done.there.append(of["path"])
         elif kept.digest(place) != of["digest"]:
             done.faults.append(
@@ -229,7 +241,7 @@ def _listed(kept: Archive) -> dict[str, dict[str, Any]]:
         return {}
 
 
-def _place(name: str) -> str:
+def archive_place(name: str) -> str:
     """Return where a file lies in an archive: files outside of the survey's folder are told apart by their paths."""
     path = PurePosixPath(name)
     if not path.is_absolute() and ".." not in path.parts:

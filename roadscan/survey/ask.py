@@ -8,20 +8,17 @@ import pyarrow as pa
 
 from roadscan.core.errors import RoadscanError, StoreError
 from roadscan.core.survey import Survey
-from roadscan.ingest.reading.format import log_formats
 from roadscan.navigation.tasks.navigate import known_keys
-from roadscan.run.stage import stages
 from roadscan.store.asset_schema import asset_tables
+from roadscan.store.query.sql import Limits, missing_table, query
 from roadscan.store.schema import schema_names
-from roadscan.store.sql import Limits, missing_table, query
 from roadscan.store.store import Store
-from roadscan.tiles.product import SurveyProduct, products
-from roadscan.tiles.tasks.wanted_products import wanted_products
 
 _MADE_BY: Final = {
     "mountings": "`roadscan calibrate` makes it, from the [[calibration]] of the survey file",
     "outputs": "`roadscan run` makes it",
     "reading_classes": "`roadscan classes` writes it as a file of its own; read that with read_parquet",
+    "run_history": "`roadscan run` writes it when it ends",
     "regions": 'a run makes it with regions = "found" in [surface]',
 }
 """What makes tables that no stage writes, or not always."""
@@ -36,7 +33,7 @@ def ask(
     unconfined: bool = False,
     limits: Limits | None = None,
 ) -> pa.Table:
-    """Return the result of a DuckDB statement over a survey's tables (:func:`roadscan.store.sql.query`).
+    """Return the result of a DuckDB statement over a survey's tables (:func:`roadscan.store.query.sql.query`).
 
     Raises
     ------
@@ -63,6 +60,11 @@ def not_made(name: str, survey: Survey) -> RoadscanError | None:
 
 def _way_to(table: str, survey: Survey) -> str | None:
     """Return what makes a table; None where no such table is known."""
+    from roadscan.ingest.reading.format import log_formats
+    from roadscan.run.stage import stages
+    from roadscan.tiles.product import SurveyProduct, products
+    from roadscan.tiles.tasks.wanted_products import wanted_products
+
     if table in asset_tables():
         return (
             f"`roadscan assets` makes it, where the survey file's [assets] asks for the kind '{asset_tables()[table]}'"

@@ -57,7 +57,6 @@ from roadscan.run.selection import Selection
 from roadscan.run.stage import stage_named, stages
 from roadscan.store.logs import has_log, read_log_records
 from roadscan.store.store import Store
-from roadscan.surface.reconstruction import SurfaceGrid
 from roadscan.surface.settings import SurfaceConfig
 from roadscan.surface.tasks.found_regions import none_across
 from roadscan.surface.tasks.surface_colours import check_cameras
@@ -454,6 +453,8 @@ def check_segmentation(asked: Asked) -> Iterator[RoadscanError]:
 
 def check_products(asked: Asked) -> Iterator[RoadscanError]:
     """Check that products and their settings are known, and that they fit the cells."""
+    from roadscan.surface.reconstruction import SurfaceGrid
+
     survey, stated = asked.survey, asked.survey.config.products
     faults = [
         fault

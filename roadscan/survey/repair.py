@@ -20,7 +20,7 @@ from roadscan.store.logs import NAVIGATION, DataFile, LogRecord, read_log_record
 from roadscan.store.repair_records import repair_records
 from roadscan.store.salvage import Lost, read_lost, salvaged, write_lost
 from roadscan.store.schema import table_schema
-from roadscan.store.sql_files import stamp_of
+from roadscan.store.stamp import stamp_of
 from roadscan.store.store import Store
 from roadscan.store.verified import note_verified
 from roadscan.survey.status import find_damage

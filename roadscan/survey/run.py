@@ -17,6 +17,7 @@ from roadscan.run.engine.compute import damaged_file, rare_collections
 from roadscan.run.selection import SelectionError
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, findings_of, stages
+from roadscan.run.told import told_run, told_stage
 from roadscan.store.holding.look import look_again
 from roadscan.store.logs import read_log_records
 from roadscan.store.manifest import begin_changes, end_changes, write_failures
@@ -42,7 +43,7 @@ def run_stages(session: Session, chosen: Sequence[Stage] | None = None) -> None:
     wanted = stages() if chosen is None else chosen
     wanted_products(session.survey)  # a wrong name or option is reported before a log is read
     check_cameras(session.survey)
-    with session.store.lock():
+    with told_run(session, [stage.name for stage in wanted]), session.store.lock():
         for stage in wanted:
             started = time.perf_counter()
             run_stage(session, stage)
@@ -59,6 +60,11 @@ def run_stage(session: Session, stage: Stage) -> None:
         _tell_upgrade(session)
         session.goes_on = begin_changes(session.store)
         session.began_ns = time.time_ns() - _CLOCK_TICK_NS
+    with told_stage(session, stage.name):
+        _run_stage(session, stage)
+
+
+def _run_stage(session: Session, stage: Stage) -> None:
     try:
         with rare_collections():
             stage.run(session)
@@ -130,10 +136,12 @@ def close_run(session: Session, done: Sequence[Stage]) -> None:
     if session.failures:
         listed = "; ".join(f"{s} {u}: {r}" for s, u, r in session.failures[:10])
         more = f"; and {len(session.failures) - 10} more (`roadscan status`)" if len(session.failures) > 10 else ""
-        raise RunError(
+        error = RunError(
             f"{counted(len(session.failures), 'unit')} failed: {listed}{more}",
             change="everything else is finished; the next run does only these",
         )
+        error.passes = session.passes
+        raise error
 
 
 def _report(session: Session) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pyarrow.parquet as pq
 
-from roadscan.core.errors import RoadscanError, StoreError
+from roadscan.core.errors import DamagedError, RoadscanError, StoreError
 from roadscan.core.witness import Finding
 from roadscan.footprints.footprints import PRODUCT
 from roadscan.georeference.plan.plan import NothingToPlaceError
@@ -21,14 +21,16 @@ from roadscan.navigation.tasks.navigate import known_keys
 from roadscan.run.session import Session
 from roadscan.run.stage import StageState, findings_of, stages
 from roadscan.store.damage import UNREADABLE
+from roadscan.store.history import history_faults
 from roadscan.store.logs import LogRecord, copy_path, has_log, read_log_records, record_path
 from roadscan.store.manifest import Manifest, OutputRecord, read_failures
 from roadscan.store.repair_records import fault_of
 from roadscan.store.salvage import Lost, read_lost
-from roadscan.store.sql_files import Stamp, stamp_of
+from roadscan.store.stamp import Stamp, stamp_of
 from roadscan.store.store import Store
 from roadscan.store.verified import held_faults, note_verified
 from roadscan.store.written_by import VERSION_FILE
+from roadscan.survey.forgotten import forgotten_pictures
 from roadscan.survey.preflight import preflight
 from roadscan.tiles.product import products
 from roadscan.tiles.tasks.tile_plan import TILE
@@ -79,6 +81,28 @@ class Status:
         """Return what the user should know, beside what is to do."""
         found = [one.line for one in self.findings]
         return [*self.checked, *found, *(note for state in self.stages.values() for note in state.notes)]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return what `roadscan status` prints as JSON values."""
+        states = {
+            name: {"current": one.current, "due": one.stale, "empty": one.empty, "why": dict(one.why)}
+            for name, one in self.stages.items()
+        }
+        return {
+            "complete": self.is_complete,
+            "logs": self.logs,
+            "unused_logs": self.unused_logs,
+            "readings": self.readings,
+            "stages": states,
+            "due": self.due,
+            "outputs": self.outputs,
+            "damaged": self.damaged,
+            "lost": [one.as_json() for one in self.lost],
+            "notes": self.notes,
+            "no_tiles": self.note or self.places_nothing,
+            "would_fail": self.would_fail,
+            "failures": self.failures,
+        }
 
     @property
     def due(self) -> dict[str, int]:
@@ -190,8 +214,10 @@ def find_damage(store: Store, report: Callable[[int, int], None] = lambda _a, _b
             *map(str, damaged),
             *damaged_sources(store),
             *_version_faults(store),
+            *_forgotten_faults(store),
             *_copy_faults(store, [r.key for r in logs]),
             *held_faults(store),
+            *history_faults(store).values(),
         ]
     )
     data = [f for r in logs for own in r.tables.values() for f in own]
@@ -226,6 +252,15 @@ def _version_faults(store: Store) -> list[str]:
     """Return the fault of the file that names the version which wrote last, if it has one."""
     if store.exists(VERSION_FILE) and not store.last_version():
         return [f"{VERSION_FILE}: it is damaged; the next run writes it anew"]
+    return []
+
+
+def _forgotten_faults(store: Store) -> list[str]:
+    """Return the fault of the record of forgotten pictures, if it has one."""
+    try:
+        forgotten_pictures(store)
+    except DamagedError as error:
+        return [str(error)]
     return []
 
 

@@ -14,8 +14,8 @@ from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, truth
 from roadscan.store.manifest import Manifest
+from roadscan.store.query.sql import query
 from roadscan.store.small_tables import small_path
-from roadscan.store.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 from roadscan.tiles.tasks.cell_files import read_cells

@@ -22,8 +22,8 @@ from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
 from roadscan.run.stage import findings_of, stage_named
 from roadscan.simulate import Scene, simulate
+from roadscan.store.query.sql import query
 from roadscan.store.small_tables import read_small, small_path
-from roadscan.store.sql import query
 from roadscan.survey.run import run_stages
 from tests.drawing import drawn
 from tests.surveys import Lines, Simulated, changed

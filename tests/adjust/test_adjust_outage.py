@@ -17,7 +17,7 @@ from roadscan.adjust.tasks.solution import Evidence, Solution
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.run.session import Session
 from roadscan.simulate import Scene, simulate
-from roadscan.store.sql import query
+from roadscan.store.query.sql import query
 from tests.surveys import Simulated
 
 pytestmark = pytest.mark.nightly

@@ -19,9 +19,9 @@ from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.simulate import simulate
+from roadscan.store.query.sql import query
 from roadscan.store.schema import table_schema
 from roadscan.store.small_tables import read_small, small_path, write_small
-from roadscan.store.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 from tests.surveys import Simulated, changed, outputs, small_scene

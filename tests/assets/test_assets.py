@@ -41,7 +41,7 @@ from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene as Street
 from roadscan.simulate import simulate
-from roadscan.store.sql import query
+from roadscan.store.query.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 from tests.assets.posts import Posts, only_kinds

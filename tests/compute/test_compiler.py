@@ -148,6 +148,35 @@ def test_variants_of_one_name_that_two_processes_compile_have_names_of_their_own
     assert first[1] and second[1] and first[1] != second[1]
 
 
+TOLD = """
+import time
+from roadscan.run import progress, session
+progress._LOOK_S = 0.05
+
+class Lines(session.Reporter):
+    def line(self, text):
+        print(text, flush=True)
+
+with progress.compiling_told(Lines()):
+    import parts
+    time.sleep(0.5)
+"""
+
+
+def test_a_run_tells_what_is_compiled(tmp_path: Path) -> None:
+    (tmp_path / "parts.py").write_text(PARTS, encoding="utf-8")
+    (tmp_path / "told.py").write_text(TOLD, encoding="utf-8")
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    command = [sys.executable, str(tmp_path / "told.py")]
+
+    def told() -> list[str]:
+        said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+        return [line for line in said.splitlines() if line.startswith("compiled")]
+
+    assert told()[-1] == "compiled, once for this machine: 2 kernels, the last is parts.up_to"
+    assert told() == []
+
+
 ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = """
 from pathlib import Path

@@ -37,8 +37,8 @@ from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import OutputRecord
+from roadscan.store.query.sql import query
 from roadscan.store.schema import table_schema
-from roadscan.store.sql import query
 from roadscan.store.writer import parquet_bytes
 from roadscan.tiles.products.geo_table import write_geo_table
 from roadscan.tiles.tasks.cell_files import read_cells

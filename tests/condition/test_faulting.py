@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from benchmarks.bench_lanes import rough_scene
 from roadscan.cli import app
 from roadscan.simulate import simulate
-from roadscan.store.sql import query
+from roadscan.store.query.sql import query
 from roadscan.store.store import Store
 
 SLAB_M = 5.0

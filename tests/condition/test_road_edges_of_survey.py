@@ -20,7 +20,7 @@ from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate.surface import Surface
-from roadscan.store.sql import query
+from roadscan.store.query.sql import query
 from roadscan.tiles.tasks.wanted_products import product_context
 
 HALF_M = 3.5

@@ -16,7 +16,7 @@ from roadscan.condition.tasks import roughness_regions
 from roadscan.condition.tasks.work import plan_condition
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
-from roadscan.store.sql import query
+from roadscan.store.query.sql import query
 
 LEAD_M = 10.0
 """The reference line begins before the road's station 0."""

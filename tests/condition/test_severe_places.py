@@ -21,7 +21,7 @@ from roadscan.cli import app
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.features import faults_of
 from roadscan.simulate.truth import Truth
-from roadscan.store.sql import query
+from roadscan.store.query.sql import query
 from roadscan.store.store import Store
 from tests.condition.test_spacing_and_severe_places import e1926
 

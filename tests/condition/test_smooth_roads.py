@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from benchmarks.bench_lanes import rough_scene
 from roadscan.cli import app
 from roadscan.simulate import simulate, truth
-from roadscan.store.sql import query
+from roadscan.store.query.sql import query
 from roadscan.store.store import Store
 from tests.condition.test_spacing_and_severe_places import e1926
 

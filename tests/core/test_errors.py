@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import datetime as dt
+import errno
 import pickle
 import tomllib
 from pathlib import Path
 
+import aiohttp
 import pytest
+from botocore.exceptions import ClientError, EndpointConnectionError, ReadTimeoutError
 
 from roadscan.core import errors
 
@@ -66,3 +69,43 @@ def test_what_is_missing_survives_pickling_and_a_new_place() -> None:
         assert [one.choices for one in other.asks_for("options.")] == [("a", "b")]
         assert list(other.asks_for("clock")) == []
     assert str(error.at("b.gpkg", 3)).startswith("b.gpkg, record 3: no layer;")
+
+
+def raised_from(error: errors.RoadscanError, cause: Exception) -> errors.RoadscanError:
+    try:
+        raise error from cause
+    except errors.RoadscanError as found:
+        return found
+
+
+def of_s3(status: int) -> Exception:
+    return ClientError({"ResponseMetadata": {"HTTPStatusCode": status}}, "GetObject")  # type: ignore[typeddict-item]
+
+
+@pytest.mark.parametrize(
+    ("cause", "why"),
+    [
+        (ConnectionResetError("reset by peer"), "a place does not answer"),
+        (OSError(errno.EHOSTUNREACH, "no route"), "a place does not answer"),
+        (EndpointConnectionError(endpoint_url="http://s3"), "a place does not answer"),
+        (ReadTimeoutError(endpoint_url="http://s3"), "a place does not answer"),
+        (aiohttp.ServerDisconnectedError(), "a place does not answer"),
+        (of_s3(503), "a place does not answer"),
+        (of_s3(429), "a place does not answer"),
+        (of_s3(403), ""),
+        (of_s3(404), ""),
+        (errors.BusyStoreError("process 7 on a is working on this store"), "another run has the store"),
+        (errors.ChangingLogError("the log changed while it was read"), "a log still changes"),
+        (FileNotFoundError("gone"), ""),
+        (OSError(errno.EIO, "bad block"), ""),
+        (errors.FullDiskError("full"), ""),
+        (errors.DamagedError("cut"), ""),
+    ],
+)
+def test_what_may_pass(cause: Exception, why: str) -> None:
+    """Errors of the system and of libraries, as the cause of one of roadscan; a worker sends it without its cause."""
+    error = raised_from(errors.StoreError("the store cannot be reached"), cause)
+    assert errors.may_pass(error) == why
+    received = pickle.loads(pickle.dumps(error))
+    received.__cause__ = received.__context__ = None  # which travel only where tblib is at work
+    assert errors.may_pass(raised_from(errors.RunError("1 unit failed"), received)) == why

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
 import shutil
@@ -101,8 +102,14 @@ def test_survey_makes_every_product(survey_file: Path, simulated: SimulatedSurve
 def test_second_run_does_nothing(rerun: Path) -> None:
     before = {f: written(rerun, f) for f in ("tables", "tiles", "products")}
     assert all(before.values())
-    assert survey(str(rerun), workers=0) == {"raw_bytes_read": 0.0}
+    events, metrics = rerun.parent / "events.jsonl", rerun.parent / "run.prom"
+    assert survey(str(rerun), workers=0, events=str(events), metrics=str(metrics)) == {"raw_bytes_read": 0.0}
     assert {f: written(rerun, f) for f in before} == before
+    told = [json.loads(line) for line in events.read_text().splitlines()]
+    assert [one["event"] for one in told].count("stage_ended") == len(told[0]["stages"]) > 10
+    assert (told[-1]["event"], told[-1]["outcome"]) == ("run_ended", "done")
+    assert f'roadscan_run_ok{{survey="{told[0]["survey"]}"}} 1.0' in metrics.read_text()
+    assert len(files(rerun, "manifest/history")) == 2
 
 
 DAY = {"start": "2026-05-04T00:00:00Z", "end": "2026-05-05T00:00:00Z"}

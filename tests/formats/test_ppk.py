@@ -20,7 +20,7 @@ from roadscan.core.toml_text import toml
 from roadscan.formats.motion import rtklib_programs
 from roadscan.formats.motion.ppk_checks import Separation, Track
 from roadscan.ingest.reading.format import format_of
-from roadscan.store.sql import query
+from roadscan.store.query.sql import query
 from roadscan.store.store import Store
 from tests.answers import roadscan
 from tests.drawing import drawn

@@ -86,6 +86,13 @@ def test_the_commands_from_publication_to_export(survey_file: Path, tmp_path: Pa
     assert "changed" in run("diff", "1", "2", "--survey", survey_file)
     assert "undoes commit 2" in run("undo", "2", "--survey", survey_file)
     assert "4 " in run("log", survey_file)
+    commits = json.loads(run("log", survey_file, "--json"))
+    assert [(c["number"], c["kind"]) for c in commits][1::2] == [(2, "edits"), (4, "undo")]
+    assert (commits[1]["who"], commits[1]["why"], commits[3]["undoes"]) == ("eva", "walked", 2)
+    edits = [e for e in json.loads(run("history", one, "--survey", survey_file, "--json")) if e["commit"] == 2]
+    assert {(e["attribute"], json.loads(e["new"])) for e in edits} == {("condition", 4), ("comments", "bent")}
+    differences = json.loads(run("diff", "1", "2", "--survey", survey_file, "--json"))
+    assert {(d["asset_id"], d["attribute"], d["after"]) for d in differences} >= {(one, "condition", "4")}
     assert "nothing to compare" in run("changes", "--survey", survey_file)
     assert "as of commit 1" in run("status", survey_file, "--as-of", "1")
     for form in ("gpkg", "geojson", "csv", "dxf"):

@@ -52,3 +52,35 @@ def test_core_on_a_plain_processor() -> None:
     places = ["tests/kernels", "tests/tiles", "tests/georeference", "tests/poses/test_trajectory.py"]
     places += ["tests/tiles/test_cell_path.py", "--ignore=tests/kernels/test_uncompiled.py"]
     without_avx512([*command, "--ignore=tests/kernels/test_plain_processor.py", *places])
+
+
+LAST_BITS = """
+import hashlib
+import numpy as np
+import scipy.linalg
+rng = np.random.default_rng(1)
+x, a = np.abs(rng.normal(size=10_001)) + 0.01, rng.normal(size=(3000, 511))
+solved = scipy.linalg.cho_solve(scipy.linalg.cho_factor(a.T @ a), x[:511])
+parts = [np.exp(-x), np.log(x), np.tan(x), np.arctan(x), x**1.3, solved, np.linalg.inv(a.T @ a)]
+print(hashlib.md5(b"".join(p.tobytes() for p in parts)).hexdigest())
+"""
+
+
+def test_libraries_compute_the_same_last_bits_on_a_plain_processor() -> None:
+    """NumPy, SciPy and OpenBLAS, whichever instructions and cores there are."""
+    plain = {
+        "NPY_DISABLE_CPU_FEATURES": "X86_V4", "OPENBLAS_CORETYPE": "Haswell", "OPENBLAS_NUM_THREADS": "1",
+        "ARROW_USER_SIMD_LEVEL": "AVX2", "OPENCV_CPU_DISABLE": "AVX512-SKX",
+    }  # fmt: skip
+    bare = {name: value for name, value in os.environ.items() if name not in plain}
+    found = {}
+    with_roadscan = f"import roadscan\n{LAST_BITS}"
+    runs = (("plain", bare | plain, LAST_BITS), ("roadscan", bare, with_roadscan), ("bare", bare, LAST_BITS))
+    for name, environment, code in runs:
+        done = subprocess.run(
+            [sys.executable, "-c", code], cwd=HERE, env=environment, capture_output=True, text=True, check=True
+        )
+        found[name] = done.stdout.strip()
+    assert found["roadscan"] == found["plain"]
+    if "avx512f" in Path("/proc/cpuinfo").read_text():
+        assert found["bare"] != found["plain"]  # otherwise the settings would not be needed

@@ -27,7 +27,7 @@ from roadscan.navigation.tasks.clocks import estimate_clocks, load_clocks
 from roadscan.run.session import Session
 from roadscan.simulate import Scene, simulate
 from roadscan.store.logs import write_log_record
-from roadscan.store.sql import query
+from roadscan.store.query.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.status import survey_status, verify_store
 from tests.drawing import drawn

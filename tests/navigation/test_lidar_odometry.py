@@ -24,7 +24,7 @@ from roadscan.navigation.odometry.registration import Matched, Sweep, match
 from roadscan.navigation.odometry.rig_motion import Way, Windows, sigmas
 from roadscan.simulate import Scene, simulate
 from roadscan.store.logs import read_log_records
-from roadscan.store.sql import query
+from roadscan.store.query.sql import query
 from roadscan.store.store import Store
 from tests.answers import first_survey, roadscan, spared
 

@@ -17,7 +17,7 @@ from roadscan.poses.trajectory import Trajectory
 from roadscan.run.session import Session
 from roadscan.simulate import Scene, simulate
 from roadscan.store.logs import NAVIGATION, read_log_records
-from roadscan.store.sql import query
+from roadscan.store.query.sql import query
 from roadscan.survey.status import survey_status
 from tests.surveys import Simulated, changed, outputs
 

@@ -12,7 +12,7 @@ import pytest
 
 from roadscan.core.survey import Survey
 from roadscan.simulate import simulate
-from roadscan.store.sql import query
+from roadscan.store.query.sql import query
 from tests.formats.gnss_observations import Sky, navigation, observe, rinex2
 from tests.navigation.test_navigate import computed, errors_of, navigating_scene, without_trajectory
 from tests.surveys import Simulated

@@ -14,7 +14,7 @@ from roadscan.ingest.planned_logs import plan_logs
 from roadscan.run.session import Session
 from roadscan.simulate import Scene
 from roadscan.store.logs import read_log_records
-from roadscan.store.sql import query
+from roadscan.store.query.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.status import survey_status, verify_store
 from tests.formats.nmea_files import Fix, write_nmea

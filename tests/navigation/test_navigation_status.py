@@ -22,7 +22,7 @@ from roadscan.simulate import simulate
 from roadscan.simulate.sensors.gnss import Solutions, write_pos
 from roadscan.simulate.sensors.imu import COLUMNS
 from roadscan.store.logs import read_log_records
-from roadscan.store.sql import query
+from roadscan.store.query.sql import query
 from roadscan.store.store import Store
 from tests.drawing import drawn
 from tests.navigation.test_navigate import navigating_scene

@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from roadscan.core.errors import RunError
-from roadscan.store.sql import query
+from roadscan.store.query.sql import query
 from tests.real_data.conftest import Place
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from roadscan.core.errors import RunError
 from roadscan.core.gpstime import gps_ns_from_utc
-from roadscan.store.sql import query
+from roadscan.store.query.sql import query
 from tests.real_data.conftest import Place
 
 PCAP_HEAD, RECORD_HEAD, UDP_HEAD, BLOCK = 24, 16, 42, 100

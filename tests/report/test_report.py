@@ -163,16 +163,19 @@ def test_a_report_without_some_section_is_made_again(
     finished: Simulated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What kept the section from being made may have passed: nothing that the report is made of tells."""
-    copy = finished.copy_with_store_to(tmp_path / "survey")
+    copy, notes = finished.copy_with_store_to(tmp_path / "survey"), list[str]()
 
     def silent(*_: object) -> None:
         raise StoreError("the store does not answer")
 
     with monkeypatch.context() as patch:
         patch.setattr(Coverage, "blocks", silent)
+        patch.setattr(Session, "note", lambda _, text: notes.append(text))
         copy.store().remove(PATH)
         keep_report(Session.open(copy.survey_file))
         assert "the store does not answer" in copy.store().read_bytes(PATH).decode()
+        # Nobody has to open the report to hear it.
+        assert notes == [f"the report lacks a section: {Coverage.title}: the store does not answer"]
     keep_report(Session.open(copy.survey_file))
     assert "the store does not answer" not in copy.store().read_bytes(PATH).decode()
 

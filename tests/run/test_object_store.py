@@ -10,7 +10,7 @@ import fsspec
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
-from roadscan.core.errors import StoreError
+from roadscan.core.errors import RunError, StoreError, may_pass
 from roadscan.core.ids import TileId
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Inline
@@ -19,7 +19,7 @@ from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.store.holding.look import look_of
 from roadscan.store.manifest import Manifest
-from roadscan.store.sql import query
+from roadscan.store.query.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 from roadscan.survey.status import survey_status, verify_store
@@ -37,7 +37,7 @@ class Remembering(MemoryFileSystem):
 
     @classmethod
     def _strip_protocol(cls, path: str) -> str:
-        return str(super()._strip_protocol(path.removeprefix("remembering:/")))
+        return str(super()._strip_protocol(path.removeprefix(f"{cls.protocol}:/")))
 
     def find(self, path: str, *_: object, detail: bool = False, **__: object) -> Any:
         try:
@@ -45,6 +45,18 @@ class Remembering(MemoryFileSystem):
         except KeyError:
             found = self.dircache[path] = super().find(path, detail=True)
         return dict(found) if detail else sorted(found)
+
+
+class Breaking(Remembering):
+    """The same; `break_off` raises an error in place of readings."""
+
+    protocol = "breaking"
+    break_off: Exception | None = None
+
+    def _open(self, path: str, mode: str = "rb", *arguments: Any, **options: Any) -> Any:
+        if mode == "rb" and "/tables/returns/" in path and Breaking.break_off is not None:
+            raise Breaking.break_off
+        return super()._open(path, mode, *arguments, **options)
 
 
 @pytest.fixture
@@ -59,6 +71,22 @@ def run(survey: Survey, store: Store, *chosen: TileId) -> Session:
     run = Session(survey, store, Inline(), Selection(named=chosen) if chosen else None, Lines())
     run_stages(run, stages())
     return run
+
+
+@pytest.mark.parametrize(
+    ("fault", "why"), [(ConnectionResetError("reset"), "a place does not answer"), (ValueError("bad"), "")]
+)
+def test_a_unit_that_met_a_silent_store_may_pass(
+    finished: Simulated, objects: str, monkeypatch: pytest.MonkeyPatch, fault: Exception, why: str
+) -> None:
+    """Its reason travels as words."""
+    fsspec.register_implementation("breaking", Breaking, clobber=True)
+    survey = Survey.load(finished.survey_file)
+    store = Store(objects.replace("remembering:", "breaking:"), survey.config.id)
+    monkeypatch.setattr(Breaking, "break_off", fault)
+    with pytest.raises(RunError, match=r"failed: footprints \S+: ") as failed:
+        run(survey, store)
+    assert may_pass(failed.value) == why
 
 
 def test_a_whole_run(finished: Simulated, objects: str) -> None:

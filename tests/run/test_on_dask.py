@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import os
+import socket
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+from distributed import Client, LocalCluster
 
+import roadscan
 from roadscan.core.errors import RoadscanError
 from roadscan.run.engine import embedded as own_cluster
 from roadscan.run.engine.embedded import embedded
 from roadscan.run.engine.on_dask import OnDask
+from roadscan.run.telling.events import Listener, UnitEnded
+from roadscan.run.telling.teller import Teller, ToldCompute
 
 DEADLY = 7
 
@@ -33,6 +39,21 @@ def test_only_the_task_that_kills_its_worker_is_lost(cluster: OnDask) -> None:
     assert isinstance(error, RoadscanError)
     assert "died" in str(error)
     assert {task: done.result for task, done in ended.items()} == {task: task**2 for task in ended}
+
+
+def test_a_task_is_told_with_the_worker_that_did_it(cluster: OnDask) -> None:
+    heard: list[UnitEnded] = []
+    listener = Listener()
+    listener.hear = lambda event: heard.append(event) if isinstance(event, UnitEnded) else None  # type: ignore[method-assign,assignment]
+    told = ToldCompute(cluster, Teller("survey", [listener], print))
+    (process,) = (done.result for done in told.map(worker, [0]))
+    assert [done.result for done in told.map(squared, [DEADLY])] == [None]
+    assert isinstance(next(told.map(inverse, [0])).error, ZeroDivisionError)
+    fine, dead, wrong = heard
+    assert (fine.outcome, fine.host, fine.process) == ("done", socket.gethostname(), process)
+    assert process != os.getpid()
+    assert (dead.outcome, dead.host, dead.seconds) == ("failed", None, None) and "died" in dead.reason
+    assert wrong.outcome == "failed" and wrong.process not in (None, os.getpid()) and "zero" in wrong.reason
 
 
 def test_an_error_is_the_tasks_own(cluster: OnDask) -> None:
@@ -56,11 +77,40 @@ def test_workers_that_are_gone_for_good_are_replaced(monkeypatch: pytest.MonkeyP
         assert [done.result for done in alone.map(squared, [3])] == [9]
 
 
+def test_a_worker_of_another_version_that_joins_later_does_no_task(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "sitecustomize.py").write_text("import roadscan\nroadscan.__version__ = '0.0.7'\n")
+    with (
+        LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as local,
+        Client(local) as client,
+    ):
+        running = OnDask(client).map(version_of, range(100))
+        ended = [next(running)]
+        monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+        local.scale(2)
+        client.wait_for_workers(2)
+        other = max(local.scheduler.workers.values(), key=lambda worker: worker.name).address
+        ended += running
+        assert {done.task: done.result for done in ended} == dict.fromkeys(range(100), roadscan.__version__)
+        assert f"workers are refused: {other} has roadscan 0.0.7; expected roadscan" in caplog.text
+        assert other not in client.nthreads()
+
+
 def test_workers_keep_their_memory(cluster: OnDask) -> None:
     (done,) = cluster.map(environment, ["MALLOC_TRIM_THRESHOLD_"])
     assert int(done.result or 0) >= 1 << 30
     (done,) = cluster.map(environment, ["OMP_NUM_THREADS"])
     assert done.result == "1"
+
+
+def version_of(_: int) -> str:
+    time.sleep(0.02)
+    return roadscan.__version__
+
+
+def worker(_: int) -> int:
+    return os.getpid()
 
 
 def squared(number: int) -> int:

@@ -757,6 +757,7 @@ def test_the_inventory_is_shown_and_edited(survey_file: Path, tmp_path: Path) ->
     (pole,) = features_of(site, layer)
     assert pole["geometry"]["coordinates"] == [west + 3.0, south + 2.0, 50.0]
     properties = {"layer": "asset_poles", "action": "change", "asset_id": pole["properties"]["asset_id"]}
+    properties["author"] = "mallory"
     document = {
         "type": "FeatureCollection", "coordinates": "map_m", "survey": "s", "inventory": session.survey.config.id,
         "commit": 1,
@@ -764,7 +765,9 @@ def test_the_inventory_is_shown_and_edited(survey_file: Path, tmp_path: Path) ->
             {"type": "Feature", "geometry": None, "properties": properties | {"attributes": {"condition": 3}}}
         ],
     }  # fmt: skip
-    told = EditDoor(lambda: opened(edited)).take(json.dumps(document).encode())
+    told = EditDoor(lambda: opened(edited)).take(json.dumps(document).encode(), "ann@example.org")
+    # The author is whom the proxy told, whatever the document says.
+    assert truth_of(opened(edited)).truth.commits[-1].who == "ann@example.org"
     assert (told["commit"], told["edits"]) == (2, [{"outcome": "accepted", "reason": ""}])
     assert served != site.document("survey.json")  # a page that begins anew sees it
     (pole,) = features_of(site, layer)

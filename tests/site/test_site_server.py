@@ -78,7 +78,7 @@ def test_a_document_is_given_whole_and_by_range(server: SiteServer) -> None:
 def editable(held: Held) -> Iterator[SiteServer]:
     """A server that takes edits; what it took stands in `held.asked`."""
 
-    def take(content: bytes) -> dict[str, str]:
+    def take(content: bytes, _who: str) -> dict[str, str]:
         if content == b"bad":
             raise StoreError("the edits <b>are</b> bad")
         held.asked.append(content.decode())

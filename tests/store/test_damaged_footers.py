@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.core.errors import DamagedError
+from roadscan.core.errors import DamagedError, StoreError, may_pass
 from roadscan.footprints.reach import opened
 from roadscan.store.codecs.parquet.list_table import write_list_table
 from roadscan.store.readings.row_groups import read_groups
@@ -75,3 +75,20 @@ def test_any_flipped_bit_of_a_checked_footer_is_damage(tmp_path: Path, how: str,
         path.write_bytes(changed)
         with pytest.raises(DamagedError, match=r"part-00000\.parquet"):
             READERS[reader](store)
+
+
+@pytest.mark.parametrize("reader", READERS)
+@pytest.mark.parametrize("error", [ConnectionResetError("reset by peer"), TimeoutError("timed out")])
+def test_a_place_that_does_not_answer_is_no_damage(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reader: str, error: OSError
+) -> None:
+    store, *_ = written(tmp_path, "plain")
+
+    def silent(*_: Any, **__: Any) -> Any:
+        raise error
+
+    for name in ("cat_file", "open"):
+        monkeypatch.setattr(store.fs, name, silent)
+    with pytest.raises((StoreError, OSError)) as told:
+        READERS[reader](store)
+    assert not isinstance(told.value, DamagedError) and may_pass(told.value) == "a place does not answer"

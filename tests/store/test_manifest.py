@@ -14,8 +14,8 @@ import pytest
 from roadscan.core.errors import StoreError
 from roadscan.store import manifest as manifest_module
 from roadscan.store.manifest import Manifest, OutputRecord
+from roadscan.store.query.sql import query
 from roadscan.store.records import Packed, latest, rows_of, table_of
-from roadscan.store.sql import query
 from roadscan.store.store import Store
 from tests.store.killed import dies_at_removal
 

@@ -22,8 +22,8 @@ from roadscan.store import manifest as manifest_module
 from roadscan.store.logs import DataFile, LogRecord, has_log, read_log_records, retire_log, write_log_record
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.merge import merged
+from roadscan.store.query.sql import connect, query
 from roadscan.store.schema import table_schema
-from roadscan.store.sql import connect, query
 from roadscan.store.store import Store
 from roadscan.store.writer import LogWriter
 from tests.store.killed import dies_at_removal

@@ -27,6 +27,8 @@ LONGEST_S: Final = 300
 SURVEY: Final = "2026-spring/SURVEY.toml"
 VOLATILE: Final = ("manifest/verified.parquet", "/lock")
 """Ends of names of files that tell of the last command, and hold no figure."""
+HISTORY: Final = "manifest/history/"
+"""Folder in which each run leaves a file of its own."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,8 @@ class Tree:
             digest = file_digest(self.work / name)
             if self.digests.get(name) != digest:
                 found[name] = digest
-        return {name: digest for name, digest in found.items() if not name.endswith(VOLATILE)}
+        kept = (name for name in found if not name.endswith(VOLATILE) and (HISTORY not in name or name in self.known))
+        return {name: found[name] for name in kept}
 
     def _stamps(self) -> dict[str, tuple[int, int]]:
         found = {}

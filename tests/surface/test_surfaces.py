@@ -30,7 +30,7 @@ from roadscan.run.stage import stages
 from roadscan.simulate import simulate
 from roadscan.simulate.truth import load
 from roadscan.store.manifest import Manifest
-from roadscan.store.sql import query
+from roadscan.store.query.sql import query
 from roadscan.store.store import Store
 from roadscan.surface.reconstruction import patch_of_cells, surface_of
 from roadscan.surface.tasks.surface_plan import SURFACE, SurfacePlan, SurfaceTask, bridged_tiles

@@ -18,7 +18,7 @@ from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.store.logs import copy_path, read_log_records, record_path
 from roadscan.store.manifest import Manifest
-from roadscan.store.sql import query
+from roadscan.store.query.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 from roadscan.survey.status import survey_status, verify_store

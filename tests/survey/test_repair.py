@@ -10,9 +10,9 @@ import pytest
 
 from roadscan.core.errors import RoadscanError, StoreError
 from roadscan.store.logs import copy_path, read_log_records, record_path
+from roadscan.store.query.sql import query
 from roadscan.store.schema import table_schema
 from roadscan.store.small_tables import small_path, write_small
-from roadscan.store.sql import query
 from roadscan.store.store import Store
 from roadscan.store.verified import Stamp
 from roadscan.survey.status import verify_store

@@ -14,8 +14,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from roadscan.core.errors import RoadscanError
-from roadscan.store.sql import Limits, connect, query
-from roadscan.store.sql_files import StoreFiles
+from roadscan.store.query.sql import Limits, connect, query
+from roadscan.store.query.sql_files import StoreFiles
 from roadscan.store.store import Store
 from tests.survey.test_damage import say
 from tests.surveys import Simulated

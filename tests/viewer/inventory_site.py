@@ -53,7 +53,7 @@ class EditedSite:
         file = self._street / path
         return Served(file, path) if file.is_file() else None
 
-    def take(self, content: bytes) -> dict[str, Any]:
+    def take(self, content: bytes, _who: str = "") -> dict[str, Any]:
         """Take in edits as `roadscan view --edit` does."""
         document = PageDocument.parse("the page", content, (1.0, 1.0, 1.0))
         pulled, outcomes = self.inventory.pull_page(document, sound=True)

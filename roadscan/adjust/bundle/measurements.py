@@ -17,7 +17,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from roadscan.adjust.observations import CAMERA, COMPONENTS, FIXED, KINDS, MOUNTED, Observations
 from roadscan.core.gpstime import NS_PER_S
@@ -148,6 +147,8 @@ class Seen:
 
 def seen(measured: Measurements, state: State, numbers: Numbers) -> Seen:
     """Returns poses of the cameras at the measurements, by a state."""
+    from scipy.spatial.transform import Rotation
+
     own = measured.exposures.at(measured.picture)
     m, lenses = own.camera.size, list[Lens]()
     mounted, filmed, middle, line = np.zeros((m, len(MOUNTED))), np.zeros((m, len(CAMERA))), np.empty(m), np.empty(m)

@@ -8,7 +8,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import chdtri
 
 from roadscan.adjust.adjustment import Adjustment
 from roadscan.adjust.bundle.measurements import Measurements, State, met_at, residuals_px, seen
@@ -77,6 +76,8 @@ class PictureOutcome:
 
 def outcome_of(approach: Approached, adjusted: Adjustment, points: Sequence[ControlPoint]) -> PictureOutcome:
     """Returns what is left by an adjustment; the rows of the pictures are the last ones of its observations."""
+    from scipy.special import chdtri
+
     pictures, rows = approach.pictures, approach.rows
     measured, own = pictures.measured, slice(adjusted.weight.size - rows.measurement.size, None)
     weight = approach.weight

@@ -14,7 +14,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from roadscan.adjust.adjustment import Adjustment, CameraErrors, adjust
 from roadscan.adjust.bundle.measurements import Measurements, State, met_at, seen
@@ -122,6 +121,8 @@ def _lag(pictures: PictureEvidence, state: State, number: int) -> int:
     Turns from picture to picture by the solution, which follows the pictures, are held against those of the recorded
     poses some pictures before or after.
     """
+    from scipy.spatial.transform import Rotation
+
     exposures, every = pictures.measured.exposures, list[Float64]()
     for k, camera in enumerate(exposures.cameras):
         rows = np.flatnonzero(exposures.camera == k)
@@ -145,6 +146,8 @@ def _lag(pictures: PictureEvidence, state: State, number: int) -> int:
 
 def _turns(turned: Float64) -> Float64:
     """Returns turns (n − 1, 3) from each of n attitudes to the next one."""
+    from scipy.spatial.transform import Rotation
+
     return np.asarray(Rotation.from_matrix(turned[:-1].transpose(0, 2, 1) @ turned[1:]).as_rotvec())
 
 
@@ -163,6 +166,8 @@ def _moved_as(measured: Measurements, state: State) -> Measurements:
     The motion that poses themselves show from one to the next holds their noise, and a clock that is off would seem to
     take that away. Pictures that are farther apart keep it.
     """
+    from scipy.spatial.transform import Rotation
+
     exposures = measured.exposures
     velocity, rate = exposures.velocity_world_m_s.copy(), exposures.rate_body_rad_s.copy()
     for number, camera in enumerate(exposures.cameras):

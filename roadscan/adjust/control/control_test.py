@@ -14,7 +14,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import chdtri
 
 from roadscan.adjust.solver_settings import AdjustmentSettings, ControlRules
 
@@ -185,6 +184,8 @@ class AppliedOffset:
 
 def quantile(chance: float, tests: int, numbers: int = 1) -> float:
     """Length of `numbers` standard normal numbers that the largest of `tests` exceeds with a chance; inf for 0."""
+    from scipy.special import chdtri
+
     if chance <= 0.0:
         return float("inf")
     return float(np.sqrt(chdtri(numbers, -np.expm1(np.log1p(-chance) / max(tests, 1)))))
@@ -291,6 +292,7 @@ def _survey_factor(groups: Sequence[SurveyErrors]) -> float:
     Wrong points are few. Where the median of all normalised leave-one-out residuals is far too large, it is the σ of
     the survey that is wrong.
     """
+    from scipy.special import chdtri
 
     def spread(factor: float) -> float:
         ratios = []

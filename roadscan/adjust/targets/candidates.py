@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy import fft
 
 from roadscan.adjust.targets.cells import Cells
 from roadscan.adjust.targets.shapes import Disc, Shape
@@ -75,6 +74,8 @@ def _grid(cells: Cells, cell_m: float, reach: int) -> tuple[Float64, Float64]:
 
 def _likeness(value: Float64, seen: Float64, shape: Shape, cell_m: float) -> tuple[Float64, Float64]:
     """Returns the correlation of each place's surroundings with the shape, and the turn."""
+    from scipy import fft
+
     half = shape.half_m * (_SURROUNDINGS if isinstance(shape, Disc) else 1.0)
     steps = int(np.ceil(half / cell_m))
     axis = np.arange(-steps, steps + 1) * cell_m

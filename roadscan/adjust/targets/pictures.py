@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import distance_transform_edt
 
 from roadscan.adjust.targets.shapes import Disc, Shape
 from roadscan.adjust.targets.values import TargetPicture
@@ -29,6 +28,8 @@ def picture_of(
     outlines : (k, 4) east, north (m, from the middle), turn (rad), size over the stated size, of each shape found.
     origin_m : (2,) map coordinates of the middle.
     """
+    from scipy.ndimage import distance_transform_edt
+
     pixels = int(np.clip(round(half_width_m / shape.half_m * _PIXELS_PER_SIZE), 24, _MOST_PIXELS))
     cell = 2.0 * half_width_m / pixels
     inside = np.all(np.abs(place_m) < half_width_m, axis=1)

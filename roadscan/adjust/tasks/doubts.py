@@ -7,8 +7,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from roadscan.adjust.control.control import Sighting
 from roadscan.adjust.control.control_faults import NAMED, WrongPoint, swapped
@@ -267,6 +265,9 @@ def not_held(runs: Sequence[str], moving: Sequence[int], links: Int64, held: set
     links : (n, 2) pairs of runs that ties join.
     held : runs with control that counts.
     """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     size = len(runs)
     graph = coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(size, size))
     group = connected_components(graph, directed=False)[1]

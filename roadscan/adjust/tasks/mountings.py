@@ -9,8 +9,6 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import null_space
-from scipy.special import chdtri
 
 from roadscan.adjust.adjustment import MountingErrors
 from roadscan.adjust.control.control_test import APART
@@ -232,6 +230,8 @@ class _Told:
     @classmethod
     def of(cls, found: MountingErrors) -> _Told:
         """Returns the equations from an adjustment that estimated all mountings."""
+        from scipy.linalg import null_space
+
         sensor, component = np.nonzero(found.prior_sigma > 0.0)
         prior = found.prior_sigma[sensor, component]
         rows = sensor * found.prior_sigma.shape[1] + component
@@ -259,6 +259,8 @@ def contradicted(found: MountingErrors) -> npt.NDArray[np.bool_]:
     Where two explain it equally well, both are among them. Components that evidence
     does not distinguish, as the height of a head and its range scale, contradict together.
     """
+    from scipy.special import chdtri
+
     count = len(found.sensors)
     none = np.zeros(count, bool)
     if not (found.prior_sigma > 0.0).any():
@@ -292,6 +294,8 @@ def causes(found: MountingErrors) -> tuple[Cause, ...]:
     """Single errors of which each explains all that contradicts the stated mountings, and none much better than the
     others; none where it takes several of them.
     """
+    from scipy.special import chdtri
+
     if not contradicted(found).any():
         return ()
     told = _Told.of(found)

@@ -10,8 +10,6 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from roadscan.adjust.tie_settings import AgainSettings, TieSettings
 from roadscan.adjust.ties.tie import HEIGHT, SHIFT
@@ -95,6 +93,9 @@ def misplaced(runs: Sequence[str], close: Iterable[tuple[str, str]], far: Mappin
     close : pairs of runs that match. far : shifts of pairs that do not.
     held : runs that are right in any case.
     """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     number = {run: k for k, run in enumerate(runs)}
     pairs = np.array([(number[a], number[b]) for a, b in close], np.int64).reshape(-1, 2)
     graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(runs), len(runs)))

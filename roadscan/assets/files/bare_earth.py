@@ -6,8 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import rasterio
-from rasterio.transform import Affine
 
 from roadscan.assets.scene import GroundModel
 from roadscan.core.errors import StoreError
@@ -26,6 +24,8 @@ def write_bare_earth(path: Path, model: GroundModel, corner_m: tuple[float, floa
     ----------
     corner_m : easting and northing of the corner that the model counts from.
     """
+    from rasterio.transform import Affine
+
     unit_m, height_m = context.map.horizontal_unit_m, context.map.vertical_unit_m
     rows = model.height_m.shape[0]
     west = (corner_m[0] + model.x_min_m) / unit_m
@@ -51,6 +51,8 @@ def read_bare_earth(content: bytes, corner_m: tuple[float, float], context: Prod
     StoreError
         where the content is no such file.
     """
+    import rasterio
+
     unit_m, height_m = context.map.horizontal_unit_m, context.map.vertical_unit_m
     try:
         with raster_settings(), rasterio.MemoryFile(content) as file, file.open() as raster:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import laspy
 import numpy as np
 import numpy.typing as npt
 import shapely
@@ -39,6 +38,8 @@ _FEWEST: Final = 20  # With fewer returns there is no drawing.
 
 def read_classified(path: Path) -> tuple[Float64, UInt8, npt.NDArray[np.uint16]]:
     """Places (n, 3: easting, northing, height), classes (n,) and intensities (n,) of a file of classified points."""
+    import laspy
+
     points: Any = laspy.read(path)
     return np.asarray(points.xyz, np.float64), np.asarray(points.classification, np.uint8), np.asarray(points.intensity)
 

@@ -6,7 +6,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from roadscan.assets.bins import cells_of
 from roadscan.assets.ground.grid import Grid
@@ -39,6 +38,8 @@ def with_crests(place: Place, grid: Grid, lowest_m: Float32, sure: Bools, drop_m
     sure : (n,) returns that lie on the ground.
     drop_m : greatest drop on both sides (m), beyond the steepest terrain of the settings, within the largest object.
     """
+    from scipy.spatial import cKDTree
+
     returns, settings = place.returns, place.settings
     found = sure.copy()
     if len(returns) <= _NEIGHBOURS:

@@ -12,7 +12,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from roadscan.assets.classes import ROAD
 from roadscan.assets.paint.components import Component
@@ -94,6 +93,8 @@ def _share_of_road(scene: Scene, found: Contrast, own: npt.NDArray[np.int64]) ->
 
 def _alike(middle: Float64, area: Float64) -> Float64:
     """Returns how many others of a like size lie within a row's distance (n,)."""
+    from scipy.spatial import cKDTree
+
     near = cKDTree(middle).query_ball_point(middle, _ROW_M)
     return np.array([sum(1 / _ALIKE < area[j] / area[i] < _ALIKE for j in some) - 1 for i, some in enumerate(near)],
                     np.float64)  # fmt: skip

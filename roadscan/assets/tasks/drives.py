@@ -8,7 +8,6 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-import scipy.spatial
 
 from roadscan.assets.tasks.plan import AssetPlan
 from roadscan.core.rig import UNMOUNTED, Mountings
@@ -49,6 +48,8 @@ class Drives:
         ----------
         seen_gps_ns : (n, 2) first and last epoch that shows each.
         """
+        import scipy.spatial
+
         found = np.zeros((len(places_m), 2))
         if not len(self.places_m):
             return found

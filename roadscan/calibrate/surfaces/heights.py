@@ -17,7 +17,6 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field
-from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
 from roadscan.calibrate.evidence import Seen, Ties, Traverse
 from roadscan.calibrate.kernels.surface_patches import MOMENTS, UNKNOWNS, Matches, match_patches, splat
@@ -264,6 +263,8 @@ def _image(one: Placed, corner_m: Float64, rows: int, columns: int, at: HeightLe
 
 def _smoothed(mass: Float64, height: Float64, at: HeightLevel) -> Float64:
     """Return the heights of cells; NaN near the edge of the seen area and near slopes that are too steep."""
+    from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
+
     mass, height = (gaussian_filter(a, _BLUR_CELLS, mode="constant", truncate=3.0) for a in (mass, height))
     near = 2 * _EDGE_CELLS + 1
     seen = minimum_filter(mass > _FILLED * float(np.median(mass[mass > 0])), near, mode="constant")

@@ -7,13 +7,9 @@ import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from roadscan.calibrate.estimator import Calibration, Prior, calibrate
 from roadscan.calibrate.evidence import Directions, Evidence, Orientation, Ties, Traverse
-from roadscan.calibrate.in_words import mounting_rows, report
-from roadscan.calibrate.picture import CalibrationPicture, draw_calibration
-from roadscan.calibrate.tasks.calibration_evidence import Collected, collect
 from roadscan.calibrate.unknowns import Estimate, ObjectPose
 from roadscan.core.errors import ConfigError, DamagedError, RunError, nearest
 from roadscan.core.extras import can_draw, need
@@ -30,6 +26,11 @@ from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.schema import table_schema
 from roadscan.store.small_tables import read_small, small_path, write_small
 from roadscan.store.store import Store
+
+if TYPE_CHECKING:
+    from roadscan.calibrate.estimator import Calibration, Prior
+    from roadscan.calibrate.picture import CalibrationPicture
+    from roadscan.calibrate.tasks.calibration_evidence import Collected
 
 Report = Callable[[str], None]
 
@@ -65,6 +66,11 @@ def calibrate_survey(survey: Survey, store: Store, say: Report = lambda _: None)
     RunError
         where a log is not ingested, or a sensor has no readings there.
     """
+    from roadscan.calibrate.estimator import calibrate
+    from roadscan.calibrate.in_words import mounting_rows, report
+    from roadscan.calibrate.picture import CalibrationPicture
+    from roadscan.calibrate.tasks.calibration_evidence import collect
+
     config = survey.config
     if not config.calibration:
         raise ConfigError(
@@ -119,6 +125,8 @@ def _keep_report(store: Store, calibration: str, text: str, picture: Calibration
 
 
 def _write_report(store: Store, manifest: Manifest, unit: str, values: dict[str, Any]) -> None:
+    from roadscan.calibrate.picture import CalibrationPicture, draw_calibration
+
     def write(path: Path) -> None:
         if unit == _TEXT:
             path.write_text(values["text"], encoding="utf-8", newline="\n")
@@ -199,6 +207,8 @@ def _objects(
     say: Report,
 ) -> dict[str, ObjectPose]:
     """Locate the calibration objects with the mountings that all other evidence gives."""
+    from roadscan.calibrate.estimator import calibrate
+
     locating = [one.locate for one in collected if one.locate is not None]
     if not locating:
         return {}
@@ -213,6 +223,8 @@ def _objects(
 
 def _prior(survey: Survey, name: str) -> Prior:
     """Return the rig file's prior of a sensor."""
+    from roadscan.calibrate.estimator import Prior
+
     if name not in survey.rig.sensors:
         known = survey.rig.sensors
         raise ConfigError(

@@ -6,7 +6,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import scipy.ndimage
 
 from roadscan.compute.kernels.edge_across import best_path, step_and_bend
 
@@ -81,6 +80,8 @@ def counted(evidence: Float64, settings: AcrossSettings = DEFAULT) -> Float64:
 
 def path_along(found: Float64, spacing_m: tuple[float, float], settings: AcrossSettings = DEFAULT) -> EdgePath:
     """Return the path of most evidence (stations, offsets) along a road."""
+    import scipy.ndimage
+
     cost = settings.farther_cost * spacing_m[1] * np.arange(found.shape[1])
     reach = max(round(settings.move_m / spacing_m[1]), 1)
     total, before = np.empty_like(found), np.empty(found.shape, np.int64)

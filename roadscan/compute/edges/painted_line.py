@@ -6,7 +6,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import scipy.ndimage
 
 from roadscan.compute.flags import runs_of
 
@@ -37,6 +36,8 @@ def without_lines(grey: Float64, spacing_m: float) -> Float64:
 
     spacing_m : across the road; NaN, where nothing is known, stays.
     """
+    import scipy.ndimage
+
     cells = round(LINE_M / spacing_m)
     cells += 1 - cells % 2
     low = scipy.ndimage.minimum_filter(np.where(np.isnan(grey), np.inf, grey), (1, cells), mode="nearest")

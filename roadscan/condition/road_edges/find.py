@@ -16,7 +16,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-import scipy.ndimage
 
 from roadscan.compute.edges.across import DEFAULT, AcrossSettings, counted, evidence_across, path_along
 from roadscan.compute.edges.painted_line import PAINT, without_lines
@@ -83,6 +82,8 @@ def first_m(lane_width_m: float) -> float:
 
 def find_edge(raster: SideRaster, lane_width_m: float, largest_sigma_m: float) -> SideEdge:
     """Find the edge on one side; distances count from the middle of the outermost lane."""
+    import scipy.ndimage
+
     spacing = (STATION_M, OFFSET_M)
     step, bend = evidence_across(raster.height_m, np.full(raster.height_m.shape, _SIGMA_HEIGHT_M), spacing)
     grey = _relative(raster)
@@ -125,6 +126,8 @@ def _relative(raster: SideRaster) -> Float64:
 
 def _lasting(change: Float64, surface: Float64) -> Float64:
     """Limit changes of intensity (σ) to the difference of the mean intensities of both sides."""
+    import scipy.ndimage
+
     size = (2 * round(DEFAULT.along_m / STATION_M) + 1, round(DEFAULT.across_m / OFFSET_M))
     size = (size[0], size[1] + 1 - size[1] % 2)
     known = np.isfinite(surface)
@@ -165,6 +168,8 @@ def _places(found: Float64, cell: npt.NDArray[np.int64], away_m: Float64) -> Flo
 
 def _judged(kinds: Float64, cell: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     """Return (s,) the kind of evidence (kinds, s, o) that is strongest beside a path around each station."""
+    import scipy.ndimage
+
     near = np.clip(cell[:, None] + np.arange(-_AROUND, _AROUND + 1), 0, kinds.shape[2] - 1)
     beside = np.take_along_axis(kinds, np.broadcast_to(near, (len(kinds), *near.shape)), axis=2).max(axis=2)
     around = scipy.ndimage.uniform_filter1d(beside, _cells(_KIND_M), axis=1, mode="nearest")
@@ -178,6 +183,8 @@ def smoothed(away_m: Float64, known: Bool, kind: npt.NDArray[np.int8]) -> tuple[
     The standard deviation combines that of the single places about the smooth line, from their median difference
     within 10 m, and that of a cell's width.
     """
+    import scipy.ndimage
+
     out, sigma = np.array(away_m), np.full(away_m.size, np.nan)
     group = np.where(known, kind.astype(np.int64) + 1, 0)
     ends = np.flatnonzero(np.diff(group, prepend=-1, append=-1))

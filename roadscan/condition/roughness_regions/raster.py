@@ -7,7 +7,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-import scipy.ndimage
 
 from roadscan.condition.natural_neighbour import interpolate
 from roadscan.condition.roughness_regions.points import RoadPoints
@@ -61,6 +60,8 @@ def intensity_raster(
     largest_gap_m : cells farther from every point are not measured.
     clip_share : share of the cells that the scale clips at each end.
     """
+    import scipy.ndimage
+
     if len(thinned) < 3:
         return None
     first = [int(np.floor(v.min() / cell_m)) for v in (thinned.x_m, thinned.y_m)]

@@ -16,7 +16,7 @@ from roadscan.core.errors import ConfigError, StoreError
 from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session
 from roadscan.store.manifest import Manifest, read_recorded
-from roadscan.store.sql import query
+from roadscan.store.query.sql import query
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.geo_table import read_geo_table, write_geo_table
 from roadscan.tiles.tasks.wanted_products import product_context

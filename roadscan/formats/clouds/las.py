@@ -22,9 +22,8 @@ import datetime as dt
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Final, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
 
-import laspy
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
@@ -37,6 +36,9 @@ from roadscan.formats.clouds.las_crs import CloudUnits, LengthUnit
 from roadscan.formats.clouds.las_file import Cloud, Head
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import Sieve, UnorderedStamps, few_rejects, options_of
+
+if TYPE_CHECKING:
+    import laspy
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -13,7 +13,7 @@ from pyproj.exceptions import CRSError as ProjCrsError
 
 from roadscan.core.crs import NO_HEIGHTS, HeightKind, StatedHeights, crs_from_text, heights_of, vertical_of
 from roadscan.core.errors import ConfigError, CrsError, Missing
-from roadscan.formats.clouds.las_file import UNREADABLE, Cloud, brief
+from roadscan.formats.clouds.las_file import Cloud, brief, unreadable
 from roadscan.ingest.reading.format import LogSource
 from roadscan.store.codecs.geo_keys import DIRECTORY, DOUBLES, TEXTS, crs_of_keys, short_keys
 
@@ -118,7 +118,7 @@ class _Written:
                     heights = heights_of(pyproj.CRS.from_wkt(nested))
                 return cls(crs, heights, None, tuple(_units_named(heights)) + tuple(_unit_words(wkt, heights)))
             keyed = crs_of_keys(records)
-        except (ProjCrsError, *UNREADABLE) as error:
+        except unreadable(ProjCrsError) as error:
             raise CrsError(
                 f"the file's CRS cannot be understood: {brief(error)}",
                 expected="WKT or GeoTIFF keys known to PROJ",
@@ -143,7 +143,7 @@ def _check_one_crs(source: LogSource, cloud: Cloud, crs: pyproj.CRS, records: Ma
     """Refuse a file whose WKT and GeoTIFF keys put its points at two places."""
     try:
         keyed = crs_of_keys(dict(records)).crs if records else None
-    except (ProjCrsError, CrsError, *UNREADABLE):
+    except unreadable(ProjCrsError, CrsError):
         return  # keys beside a WKT that holds are often rests of another program
     corner = np.asarray(cloud.reader.header.mins[:2], np.float64)
     if keyed is None or not np.isfinite(corner).all():

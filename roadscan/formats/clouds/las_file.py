@@ -11,16 +11,17 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Final, Self, TypeAlias
+from typing import TYPE_CHECKING, BinaryIO, Final, Self, TypeAlias
 
-import laspy
 import numpy as np
 import numpy.typing as npt
-from laspy.vlrs.known import WktCoordinateSystemVlr
 
 from roadscan.core.errors import FormatError
 from roadscan.ingest.reading.format import Reject
 from roadscan.store.codecs.laz import Laz, LazChunks, LazError
+
+if TYPE_CHECKING:
+    import laspy
 
 Int64 = npt.NDArray[np.int64]
 
@@ -38,14 +39,18 @@ _MOST_POINTS: Final = 1 << 62
 _TIME_OFFSET_BIT: Final = 0x40  # bit of the global encoding in LAS 1.5
 _FORMATS_WITH_TIME: Final = frozenset({1, 3, 4, 5, 6, 7, 8, 9, 10})  # point formats with gps_time
 
-UNREADABLE: Final = (
-    laspy.LaspyException, LazError, OSError, ValueError, KeyError, IndexError, TypeError, AttributeError,
-    OverflowError, MemoryError, AssertionError, struct.error,
-)  # fmt: skip
-"""Errors of laspy and the decompressor on damaged bytes."""
-
-Points: TypeAlias = tuple[int, laspy.ScaleAwarePointRecord]
+Points: TypeAlias = "tuple[int, laspy.ScaleAwarePointRecord]"
 """Number of the first point, and points."""
+
+
+def unreadable(*more: type[Exception]) -> tuple[type[Exception], ...]:
+    """Return the errors of laspy and the decompressor on damaged bytes, and `more`."""
+    import laspy
+
+    return (
+        *more, laspy.LaspyException, LazError, OSError, ValueError, KeyError, IndexError, TypeError, AttributeError,
+        OverflowError, MemoryError, AssertionError, struct.error,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -198,6 +203,8 @@ class Cloud:
     @property
     def wkt(self) -> str:
         """Return the WKT of the points' CRS; "" where the file has none."""
+        from laspy.vlrs.known import WktCoordinateSystemVlr
+
         if self.head.wkt:
             return self.head.wkt
         texts = (getattr(r, "string", "") for r in self.reader.header.vlrs if isinstance(r, WktCoordinateSystemVlr))
@@ -252,6 +259,8 @@ class Cloud:
         return min(end, end_of_chunk), end_of_chunk, bool(self.chunks.sound[chunk])
 
     def _read(self, first: int, count: int) -> tuple[laspy.ScaleAwarePointRecord | None, str]:
+        import laspy
+
         header = self.reader.header
         try:
             if self.laz is None:
@@ -261,17 +270,19 @@ class Cloud:
                 data = bytearray(self.laz.points(first, count))
                 packed = laspy.PackedPointRecord.from_buffer(data, header.point_format)
                 points = laspy.ScaleAwarePointRecord(packed.array, header.point_format, header.scales, header.offsets)
-        except UNREADABLE as error:
+        except unreadable() as error:
             return None, brief(error)
         return (points, "") if len(points) == count else (None, "they are cut off")
 
 
 def _reader(stream: BinaryIO, head: Head, path: Path) -> laspy.LasReader:
+    import laspy
+
     try:
         reader = laspy.LasReader(stream, closefd=False, read_evlrs=False)
         if head.record_bytes != reader.header.point_format.size:
             raise ValueError("point length and extra bytes disagree")
-    except UNREADABLE as error:
+    except unreadable() as error:
         raise FormatError(f"the header cannot be read: {brief(error)}", file=path) from error
     return reader
 

@@ -193,7 +193,7 @@ def find_logs(folder: Path, progress: Progress = lambda rows, share: None) -> Fo
     need_folder(folder)
     found = FoundFolder(folder.resolve())
     logs: list[FoundLog] = []
-    for path in _candidates(found.folder):
+    for path in candidates(found.folder):
         _sort_in(path, found, logs, progress)
     found.odometries = [log for log in logs if _is_odometry(log, logs)]
     logs = [log for log in logs if log not in found.odometries]
@@ -234,7 +234,7 @@ def _closeness(log: FoundLog, main: FoundLog, folder: Path) -> tuple[bool, int, 
 # --- what is a log --------------------------------------------------------------------------------
 
 
-def _candidates(folder: Path, taken: frozenset[Path] = frozenset()) -> Iterator[Path]:
+def candidates(folder: Path, taken: frozenset[Path] = frozenset()) -> Iterator[Path]:
     """Yield folder logs and files in order of name, without stores, folders of products and hidden ones.
 
     Parameters
@@ -252,7 +252,7 @@ def _candidates(folder: Path, taken: frozenset[Path] = frozenset()) -> Iterator[
             if entry not in taken:
                 yield entry
         elif entry.is_dir() and not entry.is_symlink() and not _is_store(entry):
-            yield from _candidates(entry, taken)
+            yield from candidates(entry, taken)
 
 
 def _entries(folder: Path) -> list[Path]:
@@ -424,6 +424,14 @@ def overlaps(one: LogReport, other: LogReport) -> bool | None:
     kind, a, b = spans
     meets = a[0] <= b[1] and b[0] <= a[1]
     return meets if kind != "free" or meets else None
+
+
+def weeks_of_overlap(log: FoundLog, run: FoundRun) -> set[int]:
+    """Return the GPS weeks of the run's logs of known time with which a log in seconds of the week overlaps."""
+    week_ns = WEEK_S * NS_PER_S
+    known = [one.report.time for one in run.logs if overlaps(log.report, one.report)]
+    spans = [(t.first_gps_ns, t.last_gps_ns) for t in known if t is not None and t.assumed is None]
+    return {ns // week_ns for span in spans for ns in span}
 
 
 def shared_time(one: LogReport, other: LogReport) -> float:

@@ -90,7 +90,7 @@ def write_first_survey(found: FoundFolder, survey_file: Path) -> FirstSurvey:
         )
     folder = survey_file.resolve().parent
     folder.mkdir(parents=True, exist_ok=True)
-    texts = {survey_file: "\n".join(_survey(found, folder)) + "\n"}
+    texts = {survey_file: "\n".join(survey_lines(found, folder)) + "\n"}
     if rig_file is not None:
         texts[rig_file] = "\n".join(_rig(found)) + "\n"
     for file, text in texts.items():
@@ -103,7 +103,8 @@ def write_first_survey(found: FoundFolder, survey_file: Path) -> FirstSurvey:
 # --- the survey file ------------------------------------------------------------------------------
 
 
-def _survey(found: FoundFolder, folder: Path) -> Iterator[str]:
+def survey_lines(found: FoundFolder, folder: Path) -> Iterator[str]:
+    """Yield the lines of the first survey file that is to lie in `folder`."""
     yield "# A first survey file, written by `roadscan init` from what the logs say."
     yield f"# Lines that begin with {OPEN_QUESTION} wait for you: the logs do not say it, and roadscan does not guess."
     yield f"# Complete each (???? is what is not known), take its {OPEN_QUESTION} away; `roadscan run` names the next."

@@ -9,8 +9,8 @@ from __future__ import annotations
 import datetime as dt
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Final, Literal, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Any, Final, Literal, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -121,6 +121,16 @@ class PageDocument:
             return cls(name, EditDocument.parse(values), units_m)
         except ConfigError as error:
             raise HomeError(f"the edits cannot be read: {error}", change=change, file=name) from error
+
+    def by(self, who: str) -> Self:
+        """Returns the document with all edits made by one person, whatever it says; as it is for ""."""
+        if not who:
+            return self
+        told = [
+            one.model_copy(update={"properties": one.properties.model_copy(update={"author": who})})
+            for one in self.edits.features
+        ]
+        return replace(self, edits=self.edits.model_copy(update={"features": told}))
 
 
 class PageEdits(Home):

@@ -15,7 +15,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from roadscan.core.errors import NavigationError
 from roadscan.navigation.inertial.earth import EARTH_RATE_ECEF_RAD_PER_S, ecef_from_level, gravity_ecef
@@ -138,6 +137,8 @@ class _Motion:
     def of(
         cls, imu: ImuReadings, gnss: GnssSolutions, still: Bool, vehicle: VehicleSensors, *, instant: bool
     ) -> _Motion:
+        from scipy.spatial.transform import Rotation
+
         epochs, position, velocity = _velocities(gnss)
         inside = (epochs > imu.epochs_gps_ns[0]) & (epochs < imu.epochs_gps_ns[-1])
         epochs, position, velocity = epochs[inside], position[inside], velocity[inside]
@@ -249,6 +250,8 @@ def _gyrocompass(
 
 def _course(motion: _Motion, rotation: Float64, vehicle: VehicleSensors) -> tuple[Float64, float] | None:
     """Return `rotation` turned about the vertical so that the body's forward axis points along the course."""
+    from scipy.spatial.transform import Rotation
+
     speed = np.linalg.norm(motion.velocity @ motion.level[:, :2], axis=1)
     fast = np.flatnonzero(speed > _COURSE_M_PER_S)
     if fast.size == 0:

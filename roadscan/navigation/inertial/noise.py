@@ -17,7 +17,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import uniform_filter1d
 
 from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2
 from roadscan.core.settings.smoothing import SmootherConfig
@@ -121,6 +120,8 @@ def imu_noise(
 
 def _trembling(vectors: Float64, size: int) -> Float64:
     """Variance (n, 3) of white noise with these second differences, which pass the upper half of the band."""
+    from scipy.ndimage import uniform_filter1d
+
     bend = np.zeros_like(vectors)
     bend[1:-1] = vectors[1:-1] - 0.5 * (vectors[:-2] + vectors[2:])
     return np.asarray(uniform_filter1d(bend**2, max(size, 1), axis=0) / 1.5)

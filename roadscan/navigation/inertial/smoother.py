@@ -15,7 +15,6 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import chdtri
 
 from roadscan.core.crs import LOCAL_WORLD
 from roadscan.core.errors import NavigationError
@@ -178,6 +177,8 @@ def _layout(odometer: OdometerReadings | None, vehicle: VehicleSensors, config: 
 
 
 def _model(vehicle: VehicleSensors, config: SmootherConfig) -> Model:
+    from scipy.special import chdtri
+
     errors = vehicle.imu_errors
     return Model(
         gyro_bias=_gyro_bias_sigma(vehicle),

@@ -6,7 +6,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings, VehicleSensors
 
@@ -32,6 +31,8 @@ def standing(imu: ImuReadings, gnss: GnssSolutions, odometer: OdometerReadings |
     a sample stands when rate and force tremble no more than there, and nothing says that it moves. Where nothing ever
     stands, the noise of the data sheet is the measure.
     """
+    from scipy.ndimage import minimum_filter1d
+
     seconds = (imu.epochs_gps_ns - imu.epochs_gps_ns[0]) * 1e-9
     if seconds.size < 10:
         return np.zeros(seconds.size, bool)
@@ -70,6 +71,8 @@ def _limit(trembles: Float64, stands: Bool, moves: Bool, noise: float, step_s: f
 
 def _trembling(vectors: Float64, size: int) -> Float64:
     """Return the variance (n,) within windows of `size`, summed over axes."""
+    from scipy.ndimage import uniform_filter1d
+
     centred = vectors - vectors.mean(axis=0)
     mean = uniform_filter1d(centred, size, axis=0)
     square = uniform_filter1d(centred**2, size, axis=0)
@@ -91,6 +94,8 @@ def _speed(epochs: Int64, gnss: GnssSolutions) -> Float64:
 
 def _counted(epochs: Int64, odometer: OdometerReadings) -> Float64:
     """Return the distance (m) that the odometer counted within half a window on both sides, NaN where it has none."""
+    from scipy.ndimage import maximum_filter1d
+
     at, distance = odometer_distance(odometer)
     if at.size < 2:
         return np.full(epochs.size, np.nan)

@@ -15,8 +15,6 @@ from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from roadscan.core.extras import needed
 from roadscan.core.gpstime import NS_PER_S
@@ -176,6 +174,8 @@ class _Matcher:
 
 def _step(motion: Float64, seconds: float) -> Float64:
     """Return the (4, 4) displacement by a motion of a while."""
+    from scipy.spatial.transform import Rotation
+
     step = np.eye(4)
     step[:3, 3] = motion[:3] * seconds
     step[:3, :3] = Rotation.from_rotvec(motion[3:] * seconds).as_matrix()
@@ -184,11 +184,15 @@ def _step(motion: Float64, seconds: float) -> Float64:
 
 def _rate(step: Float64, seconds: float) -> Float64:
     """Return the motion whose :func:`_step` is `step`."""
+    from scipy.spatial.transform import Rotation
+
     return np.concatenate([step[:3, 3], Rotation.from_matrix(step[:3, :3]).as_rotvec()]) / seconds
 
 
 def _least_held(points_m: Float64, around_m: Float64) -> float:
     """Return how well surfaces hold points (n, 3) along the worst direction: mean square of their normals along it."""
+    from scipy.spatial import cKDTree
+
     _, near = cKDTree(around_m).query(points_m, k=min(_NEIGHBOURS, len(around_m)))
     patches = around_m[near] - around_m[near].mean(axis=1, keepdims=True)
     size, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", patches, patches))

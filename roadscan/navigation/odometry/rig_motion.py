@@ -7,7 +7,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation, Slerp
 
 from roadscan.core.frames import ENU_FROM_NED
 from roadscan.core.gpstime import NS_PER_S
@@ -85,6 +84,8 @@ def windows_of(
     way: Way, epochs_gps_ns: Int64, force_body_m_per_s2: Float64, rate_body_rad_per_s: Float64
 ) -> Windows | None:
     """Return what an IMU's samples (m,), (m, 3), (m, 3) say of a way; None where they cover no whole window."""
+    from scipy.spatial.transform import Rotation, Slerp
+
     own = (epochs_gps_ns >= way.epochs_gps_ns[0]) & (epochs_gps_ns <= way.epochs_gps_ns[-1])
     limits = np.arange(way.epochs_gps_ns[0], way.epochs_gps_ns[-1] + 1, round(WINDOW_S * NS_PER_S))
     if limits.size < 2 or own.sum() < 2:
@@ -121,6 +122,8 @@ def _velocity(way: Way, seconds: Float64) -> Float64:
 
 def levelled(way: Way, windows: Windows) -> Way:
     """Return the way turned so that the mean of all specific forces points up."""
+    from scipy.spatial.transform import Rotation
+
     (turn,) = _to_up(windows.up_world.mean(axis=0, keepdims=True))
     return way.turned(Rotation.from_rotvec(turn).as_matrix())
 
@@ -131,6 +134,8 @@ def unbent(way: Way, windows: Windows, is_held: npt.NDArray[np.bool_]) -> Way:
     Each step between two poses is turned like the poses; what the lidar measured of it stays as it is. Pieces in which
     surfaces do not hold a pose (n,) do not count: the speed is guessed there, and with it what is left of the forces.
     """
+    from scipy.spatial.transform import Rotation
+
     guessed = np.searchsorted(windows.epochs_gps_ns, way.epochs_gps_ns[~is_held], side="right") - 1
     counts = ~np.isin(np.arange(len(windows.up_world)), guessed)
     if not counts.any():

@@ -13,14 +13,12 @@ from roadscan.core.survey import Survey
 from roadscan.ingest.ingest import ingested_of, survey_records
 from roadscan.ingest.planned_logs import Logs, plan_logs
 from roadscan.navigation.tasks.computed_trajectory import PlannedTrajectory
-from roadscan.navigation.tasks.navigation_pictures import draw_trajectories
 from roadscan.navigation.tasks.odometry_trajectory import plan_odometry
 from roadscan.navigation.tasks.solve_trajectory import plan_solutions
 from roadscan.navigation.tasks.spline_trajectory import plan_splines
 from roadscan.run.session import Session, found_once
 from roadscan.store.logs import NAVIGATION, LogRecord, has_log, read_log_records, retire_log, write_log_record
 from roadscan.store.store import Store
-from roadscan.store.writer import LogWriter
 
 
 def plan_trajectories(survey: Survey, store: Store, records: Sequence[LogRecord]) -> list[PlannedTrajectory]:
@@ -47,6 +45,8 @@ def navigate(
     RunError
         after all runs were tried, if one could not be computed; the others are kept.
     """
+    from roadscan.navigation.tasks.navigation_pictures import draw_trajectories
+
     done: list[LogRecord] = []
     failures: list[str] = []
     wanted = plan_trajectories(survey, store, survey_records(survey, store, logs))
@@ -109,6 +109,8 @@ def known_keys(survey: Survey, store: Store, logs: Logs | None = None) -> list[s
 
 def keep_trajectory(store: Store, planned: PlannedTrajectory, report: Callable[[str], None]) -> None:
     """Compute a trajectory and store it, in place of an older one of its run."""
+    from roadscan.store.writer import LogWriter
+
     computed = planned.compute(report)
     with store.scratch() as folder:
         writer = LogWriter(folder, None)

@@ -11,7 +11,6 @@ import numpy.typing as npt
 
 from roadscan.core.errors import ConfigError
 from roadscan.core.survey import Survey
-from roadscan.navigation.spline import smoothed
 from roadscan.navigation.tasks.computed_trajectory import Computed, sigma_figures, trajectory_rows
 from roadscan.poses.trajectory import Trajectory
 from roadscan.run.code_reach import code_digest, name_of
@@ -49,6 +48,8 @@ class PlannedSpline:
         ConfigError
             where the run's logs lie in different world frames.
         """
+        from roadscan.navigation.spline import smoothed
+
         worlds = {str(r.attributes["world_frame"]) for r in self.records}
         if len(worlds) != 1:
             raise ConfigError(f"run '{self.run}' has trajectories in different world frames", expected="one datum")

@@ -7,7 +7,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
@@ -103,6 +102,8 @@ def _unit(descriptor: UInt8) -> Float32:
 
 def _fitted(rays: tuple[Float64, Float64], relative: Relative, band: float, noise: float) -> Float64:
     """Returns the angle (m,) of each match to its epipolar line, for the relative pose that most of them agree with."""
+    from scipy.spatial.transform import Rotation
+
     turn, base = relative.turn.copy(), relative.base / np.linalg.norm(relative.base)
     sigma_base = min(relative.sigma_direction_rad, _LOOSEST_RAD)
     prior = 1.0 / np.array([*[relative.sigma_turn_rad**2] * 3, *[sigma_base**2] * 2])

@@ -7,7 +7,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.pictures.exposures import Exposures
@@ -55,6 +54,8 @@ def _revisits(
     exposures: Exposures, settings: PictureTiesConfig, axis: Float64, alike: float
 ) -> Iterator[tuple[int, int]]:
     """Yields each picture with the nearest of each other camera, and of its own at another time."""
+    from scipy.spatial import cKDTree
+
     eye, epoch, camera = exposures.eye_world_m, exposures.epoch_gps_ns, exposures.camera
     worlds = [exposures.cameras[k].world for k in camera.tolist()]
     for world in sorted(set(worlds)):

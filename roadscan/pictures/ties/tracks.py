@@ -7,8 +7,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-import scipy.sparse
-from scipy.sparse.csgraph import connected_components
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -29,6 +27,9 @@ def tracks_of(first: Int64, second: Int64, picture: Int64) -> tuple[Int64, Int64
     first, second : (k,) features that show one place.
     picture : (f,) of each feature.
     """
+    import scipy.sparse
+    from scipy.sparse.csgraph import connected_components
+
     size = picture.size
     edges = scipy.sparse.coo_array((np.ones(first.size, bool), (first, second)), shape=(size, size))
     _, track = connected_components(edges, directed=False)

@@ -9,11 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
-import rasterio
 from PIL import Image
-from rasterio.enums import Resampling
-from rasterio.errors import RasterioError
-from rasterio.io import MemoryFile
 
 from roadscan.adjust.tasks.outcome import PICTURES as ADJUSTMENT_PICTURES
 from roadscan.condition.tasks.pictures import PICTURES as CONDITION_PICTURES
@@ -47,6 +43,8 @@ class Made(Section):
 
     def blocks(self, material: Material) -> Iterator[Block]:
         """Yield a row per product, then small pictures of the first rasters and pictures of each survey product."""
+        from rasterio.errors import RasterioError
+
         session = material.session
         files = {name: one for name, one in material.summary.files.items() if name != "report"}
         if not files:
@@ -94,6 +92,8 @@ def _shown(session: Session) -> Iterator[OutputRecord]:
 
 
 def _small_picture(store: Store, record: OutputRecord) -> bytes | None:
+    from rasterio.io import MemoryFile
+
     if record.bytes > _MOST_BYTES and not store.is_folder:
         return None
     if not record.path.endswith(".tif"):
@@ -107,6 +107,9 @@ def _small_picture(store: Store, record: OutputRecord) -> bytes | None:
 
 
 def _reduced(path: str) -> Image.Image:
+    import rasterio
+    from rasterio.enums import Resampling
+
     with rasterio.open(path) as file:
         share = min(1.0, _EDGE / max(file.width, file.height))
         shape = (max(1, round(file.height * share)), max(1, round(file.width * share)))

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
-from roadscan.core.errors import DamagedError, RoadscanError
+from roadscan.core.errors import DamagedError, RoadscanError, may_pass
 from roadscan.core.stopping import stop_if_asked
 
 T = TypeVar("T")
@@ -27,7 +27,14 @@ class Done(Generic[T, R]):
     error: Exception | None
 
 
-def reason_of(error: Exception | None) -> str:
+class Reason(str):
+    """Why a task failed, in words; it keeps what `may_pass` says of the error, which itself stays with the worker."""
+
+    passes: str = ""
+    """Why the same may succeed later, empty where nothing says so."""
+
+
+def reason_of(error: Exception | None) -> Reason:
     """Return why a task failed, for the list of failures.
 
     Raises
@@ -37,8 +44,10 @@ def reason_of(error: Exception | None) -> str:
     """
     stop_if_asked()
     if error is None:
-        return "the worker gave no result"
-    return str(error) if isinstance(error, RoadscanError) else f"{type(error).__name__}: {error}"
+        return Reason("the worker gave no result")
+    reason = Reason(error if isinstance(error, RoadscanError) else f"{type(error).__name__}: {error}")
+    reason.passes = may_pass(error)
+    return reason
 
 
 def damaged_file(error: Exception | None) -> str:

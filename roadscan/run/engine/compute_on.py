@@ -64,7 +64,8 @@ def compute_on(
     Parameters
     ----------
     workers : number of worker processes; 0 computes in this process; None takes one a core.
-    scheduler : address such as ``tls://host:8786``.
+    scheduler : address such as ``tls://host:8786``. Where neither it nor `workers` is given, the environment variable
+        ``ROADSCAN_SCHEDULER`` may name one.
     dashboard : receives the address of the embedded cluster's dashboard when it opens; None: there is none.
 
     Raises
@@ -72,6 +73,8 @@ def compute_on(
     ConfigError
         for a negative number of workers: nobody would do the tasks; for a dashboard without an embedded cluster.
     """
+    if scheduler is None and workers is None and dashboard is None:
+        scheduler = os.environ.get("ROADSCAN_SCHEDULER") or None
     if workers is not None and workers < 0:
         raise ConfigError(f"{workers} workers", expected="0 (compute in this process) or more")
     if dashboard is not None and (scheduler is not None or workers == 0):

@@ -15,8 +15,11 @@ import dask
 from distributed import Client, KilledWorker
 from distributed.protocol import pickle
 
-from roadscan.core.errors import RoadscanError
+from roadscan import __version__
+from roadscan.core.errors import RoadscanError, RunError
+from roadscan.core.extras import need
 from roadscan.run.engine.compute import Done
+from roadscan.run.engine.watch import OtherVersionError, Watch, check_version, refuse_others, title_of
 from roadscan.store.holding.look import others_write
 
 T = TypeVar("T")
@@ -29,11 +32,21 @@ QUIET_CLIENT = {
 """Settings of Dask: its log of messages holds whole tasks, by default the last 1,000 of each worker; and nobody who
 runs a survey can change how large a task is."""
 
+_GATEWAY = "gateway:"
+"""What an address begins with that names a cluster of dask-gateway."""
+
 _HELD_A_THREAD = 2
 """Least tasks per worker thread that the scheduler holds while there are any …"""
 
 _MORE_HELD = 28
 """… and more in total while many wait, so that one message carries several short tasks."""
+
+_LOST_S = 35.0
+"""Time that a lost scheduler has to answer again (s), and between looks whether there are workers: Dask's client tries
+for 30 s to reach it."""
+
+_LOOK_S = 0.2
+"""Time between looks at a client that connects again (s)."""
 
 _TOGETHER_S = 0.02
 """Seconds for which results wait for others (at most half of them), so that one message requests all."""
@@ -45,6 +58,8 @@ class OnDask:
     def __init__(self, client: Client, workers: int | None = None) -> None:
         """`workers` is how many there are when all are alive, where that is known."""
         self._client, self._workers = client, workers
+        self._address = client.scheduler.address
+        self._watch = Watch(client)
 
     @property
     def workers(self) -> int:
@@ -55,22 +70,26 @@ class OnDask:
         return int(max(1, sum(self._client.nthreads().values())))
 
     def map(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Done[T, R]]:
-        """Run all tasks, most of them in parallel; a task is retried once if its worker dies.
+        """Run all tasks, most of them in parallel; one is tried once more if its worker, or the scheduler, is lost.
 
-        Tasks that waited at the same worker fail with it. So all of them are tried again when the others have ended, on
-        half of the threads and no more than are alive, where none waits behind another: what dies there is at fault
-        itself.
+        A worker that has another version does no task, and is lost as well. Tasks that waited at the same worker fail
+        with it. So all of them are tried again when the others have ended, on half of the threads and no more than are
+        alive, where none waits behind another: what dies there is at fault itself.
+
+        Raises
+        ------
+        RunError
+            The scheduler is gone, or nobody has been there for minutes to do what waits.
         """
         others_write()
         threads = self.workers
         died: list[T] = []
         for done in self._ended(function, tasks, lambda left: _HELD_A_THREAD * threads + min(_MORE_HELD, left // 4)):
-            if isinstance(done.error, KilledWorker):
+            if isinstance(done.error, _LostError):
                 died.append(done.task)
             else:
                 yield done
-        for done in self._ended(function, died, lambda _: max(1, min(threads // 2, self._alive()))):
-            yield Done(done.task, None, _death()) if isinstance(done.error, KilledWorker) else done
+        yield from self._ended(function, died, lambda _: max(1, min(threads // 2, self._alive())))
 
     def send(self, function: Callable[[T], R], tasks: Sequence[T]) -> list[Any]:
         """Submit tasks to the scheduler; return their futures.
@@ -79,7 +98,7 @@ class OnDask:
         """
         keys = [f"{function.__name__}-{uuid.uuid4().hex}" for _ in tasks]
         sent = [pickle.dumps((function, task)) for task in tasks]
-        return list(self._client.map(_called, sent, key=keys, pure=False, retries=0))
+        return list(self._client.map(_called, sent, version=__version__, key=keys, pure=False, retries=0))
 
     def _ended(
         self, function: Callable[[T], R], tasks: Sequence[T], held: Callable[[int], int]
@@ -100,27 +119,63 @@ class OnDask:
 
         handed_out = hand_out(0)
         while running:
-            futures = _taken(ended, len(running) // 2)
+            futures = self._taken(ended, len(running) // 2)
+            self._check_scheduler()
             own = [running.pop(future.key) for future in futures]
             handed_out = hand_out(handed_out)
-            results = self._client.gather({future.key: future for future in futures}, errors="skip")
+            good = {future.key: future for future in futures if future.status == "finished"}
+            results = self._client.gather(good, errors="skip")
+            batch = {future.key: task for future, task in zip(futures, own, strict=True)}
             for future, task in zip(futures, own, strict=True):
-                error = future.exception() if future.status != "finished" else None
+                error = None if future.key in results else self._fault(future, function, running | batch)
                 future.release()
                 yield Done(task, None if error is not None else pickle.loads(results.pop(future.key)), error)
 
+    def _fault(self, future: Any, function: Callable[[T], R], held: dict[str, T]) -> Exception | None:
+        """Return the error of a task, in words where it was lost with its worker or with the scheduler."""
+        if future.status != "error":
+            return _LostError("the scheduler lost this task", expected="a scheduler that stays", change="run again")
+        error: Exception | None = future.exception()
+        if isinstance(error, OtherVersionError):
+            who = self._watch.refuse(error)
+            return _LostError(who, expected=error.expected, change="install the same version in all places")
+        if not isinstance(error, KilledWorker):
+            return error
+        titles = {key: title_of(function, task) for key, task in held.items()}
+        death = self._watch.death(error.last_worker, future.key, titles)
+        return _LostError(
+            f"each worker that began this task died of it, at last {death}",
+            expected="a worker that lives",
+            change="most often memory is short: give fewer workers (--workers), or smaller tiles ([tiles] size_m)",
+        )
 
-def _death() -> RoadscanError:
-    return RoadscanError(
-        "each worker that began this task died of it",
-        expected="a worker that lives",
-        change="most often memory is short: give fewer workers (--workers), or smaller tiles ([tiles] size_m)",
-    )
+    def _check_scheduler(self) -> None:
+        """Wait for a scheduler that the client has lost; RunError where it does not come back."""
+        until = time.monotonic() + _LOST_S
+        while self._client.status == "connecting" and time.monotonic() < until:
+            time.sleep(_LOOK_S)
+        if self._client.status != "running":
+            raise RunError(
+                f"the Dask scheduler {self._address} is gone",
+                expected="a scheduler that answers until the run ends",
+                change="start it and its workers, and run again: what is finished stays",
+            )
+
+    def _taken(self, ended: queue.SimpleQueue[Any], wanted: int) -> list[Any]:
+        """Return the next futures to end: as many as are wanted, or those of a short time."""
+        while True:
+            try:
+                return _more_of(ended, [ended.get(timeout=_LOST_S)], wanted)
+            except queue.Empty:
+                self._watch.check_workers()
 
 
-def _taken(ended: queue.SimpleQueue[Any], wanted: int) -> list[Any]:
-    """Return the next futures to end: as many as are wanted, or those of a short time."""
-    taken = [ended.get()]
+class _LostError(RoadscanError):
+    """A task has no result, because whoever worked at it is gone."""
+
+
+def _more_of(ended: queue.SimpleQueue[Any], taken: list[Any], wanted: int) -> list[Any]:
+    """Return the futures taken, with others that end in a short time."""
     until = time.perf_counter() + _TOGETHER_S
     with contextlib.suppress(queue.Empty):
         while len(taken) < wanted and (left_s := until - time.perf_counter()) > 0:
@@ -130,12 +185,13 @@ def _taken(ended: queue.SimpleQueue[Any], wanted: int) -> list[Any]:
     return taken
 
 
-def _called(sent: bytes) -> bytes:
+def _called(sent: bytes, version: str) -> bytes:
     """Return the serialised result of a function and its task, as :class:`OnDask` sends them (runs on a worker).
 
     It is made to bytes while the task runs: a result that cannot be is the task's error then, and one whose worker dies
-    of it counts as a death.
+    of it counts as a death. A worker of another version than the run's reads nothing.
     """
+    check_version(version)
     function, task = pickle.loads(sent)
     result: bytes = pickle.dumps(function(task))
     _freeze()
@@ -152,11 +208,23 @@ def _freeze() -> None:
     gc.freeze()
 
 
+def _client(scheduler: str) -> Client:
+    name = scheduler.removeprefix(_GATEWAY)
+    if name == scheduler:
+        return Client(scheduler, timeout="30s")
+    need("dask_gateway", f"--scheduler {scheduler}")
+    from dask_gateway import Gateway
+
+    return Gateway().connect(name, shutdown_on_close=False).get_client()
+
+
 @contextlib.contextmanager
 def connected(scheduler: str) -> Iterator[OnDask]:
     """Connect to the cluster of a scheduler (such as ``tls://host:8786``); without workers, tasks wait for one.
 
-    Certificates for TLS come from Dask's configuration (``distributed.comm.tls``).
+    Certificates for TLS come from Dask's configuration (``distributed.comm.tls``). ``gateway:NAME`` is a cluster of
+    dask-gateway, whose address and user come from there, too (``gateway.address``, ``gateway.auth``). Workers with
+    another version of roadscan are refused.
 
     Raises
     ------
@@ -165,7 +233,7 @@ def connected(scheduler: str) -> Iterator[OnDask]:
     """
     with dask.config.set(QUIET_CLIENT):
         try:
-            client = Client(scheduler, timeout="30s")
+            client = _client(scheduler)
         except TypeError as error:  # Dask's way to report that it has no certificate
             raise RoadscanError(
                 f"the scheduler {scheduler} is reached by TLS, and no certificate is stated",
@@ -175,8 +243,9 @@ def connected(scheduler: str) -> Iterator[OnDask]:
         except (OSError, ValueError) as error:
             raise RoadscanError(
                 f"no Dask scheduler answers at {scheduler}",
-                expected="tls://host:port or tcp://host:port, as the scheduler was started",
+                expected="tls://host:port or tcp://host:port, as the scheduler was started, or gateway:NAME",
                 change=str(error),
             ) from error
         with client:
+            refuse_others(client, scheduler)
             yield OnDask(client)

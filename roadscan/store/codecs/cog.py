@@ -16,14 +16,12 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import TYPE_CHECKING, Any, BinaryIO, Final
 from xml.sax.saxutils import escape
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-from rasterio.io import MemoryFile
-from rasterio.transform import Affine
 
 from roadscan.core.crs import MapFrame
 from roadscan.store.codecs import SOFTWARE
@@ -31,6 +29,9 @@ from roadscan.store.codecs.gdal import raster_crs, raster_settings
 from roadscan.store.codecs.kernels.raster_blocks import cut_lines, encode_block, encode_cells, round_values
 from roadscan.store.codecs.tiff import Page, Tag, digest_item, tiff_parts
 from roadscan.store.codecs.zlib_stream import compressed
+
+if TYPE_CHECKING:
+    from rasterio.transform import Affine
 
 BLOCK: Final = 512
 """Largest edge of a compressed block (pixels)."""
@@ -361,6 +362,9 @@ def _description(about: About) -> list[Tag]:
 @functools.lru_cache(maxsize=16)
 def _geo_keys(frame: MapFrame) -> tuple[Tag, ...]:
     """Return tags that state the CRS, as GDAL writes them into a file with that CRS."""
+    from rasterio.io import MemoryFile
+    from rasterio.transform import Affine
+
     profile = {"driver": "GTiff", "width": 1, "height": 1, "count": 1, "dtype": "uint8"}
     with raster_settings(), MemoryFile() as memory:
         with memory.open(**profile, crs=raster_crs(frame), transform=Affine(1, 0, 1, 0, -1, 1)):

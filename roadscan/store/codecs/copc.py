@@ -14,11 +14,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
-import laspy
 import lazrs
 import numpy as np
 import numpy.typing as npt
-from laspy.vlrs.known import LasZipVlr
 
 from roadscan.core.errors import StoreError
 from roadscan.store.codecs.las import VLR_RECORD_ID, VLR_USER_ID, Layout
@@ -140,6 +138,9 @@ class CopcWriter:
         self._write_header(hierarchy_at + _EVLR_HEADER, root_bytes)
 
     def _write_header(self, root_at: int = 0, root_bytes: int = 0) -> None:
+        import laspy
+        from laspy.vlrs.known import LasZipVlr
+
         header, (corner, edge) = self._header, self._cube
         half = 0.5 * edge * float(header.scales[0])
         low = np.array(corner) * header.scales + header.offsets

@@ -11,13 +11,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import pyproj
-import rasterio
 from pyproj.crs.crs import CompoundCRS
 from pyproj.database import query_crs_info
 from pyproj.enums import PJType
 from pyproj.exceptions import CRSError as ProjCrsError
-from rasterio.errors import RasterioError
-from rasterio.io import MemoryFile
 
 from roadscan.store.codecs.gdal import without_place_warning
 
@@ -131,6 +128,10 @@ def _false_origin(crs: pyproj.CRS) -> bool:
 
 
 def _read(picture: bytes, linear_units: str) -> pyproj.CRS | None:
+    import rasterio
+    from rasterio.errors import RasterioError
+    from rasterio.io import MemoryFile
+
     options = {"GTIFF_LINEAR_UNITS": linear_units, "GTIFF_REPORT_COMPD_CS": "YES", "GTIFF_SRS_SOURCE": "GEOKEYS"}
     try:
         with without_place_warning(), rasterio.Env(**options), MemoryFile(picture) as file, file.open() as opened:

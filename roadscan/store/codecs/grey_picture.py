@@ -11,14 +11,16 @@ import struct
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import numpy.typing as npt
-from rasterio.transform import Affine
 
 from roadscan.core.errors import StoreError
 from roadscan.store.codecs.zlib_stream import compressed, crc32
+
+if TYPE_CHECKING:
+    from rasterio.transform import Affine
 
 Grey = npt.NDArray[np.uint8]
 

@@ -10,21 +10,19 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-import laspy
-import lazrs
 import numpy as np
 import numpy.typing as npt
 from blake3 import blake3
-from laspy.header import GpsTimeType
-from laspy.vlrs.known import ClassificationLookupVlr, LasZipVlr, WktCoordinateSystemVlr
-from lazrs import LazrsError
 from pyproj.exceptions import CRSError
 
 from roadscan.core.crs import MapFrame
 from roadscan.core.errors import CrsError, StoreError
 from roadscan.store.codecs import SOFTWARE
+
+if TYPE_CHECKING:
+    import laspy
 
 VLR_USER_ID: Final = "roadscan"
 VLR_RECORD_ID: Final = 1  # record id of roadscan's facts
@@ -69,6 +67,10 @@ class Layout:
 
 @functools.lru_cache(maxsize=16)
 def _header(layout: Layout) -> laspy.LasHeader:
+    import laspy
+    from laspy.header import GpsTimeType
+    from laspy.vlrs.known import ClassificationLookupVlr, WktCoordinateSystemVlr
+
     header = laspy.LasHeader(version="1.4", point_format=layout.point_format)
     header.scales = np.array(layout.scales)
     header.offsets = np.zeros(3)
@@ -104,6 +106,10 @@ def write_points(
     records : (n,) of the layout's type, 1 or more.
     date : stands as the date of creation, so that the same points give the same bytes.
     """
+    import laspy
+    import lazrs
+    from laspy.vlrs.known import LasZipVlr
+
     digest = _Digest(layout.scales, offsets, [_wkt1(layout.map, layout.product)])
     digest.add(records)
     stated = json.dumps({**facts, "blake3": digest.text()}, sort_keys=True).encode("ascii")
@@ -154,6 +160,9 @@ def _state_extremes(description: Any, values: npt.NDArray[Any]) -> None:
 
 def check_points(path: Path) -> None:
     """Decode every point and compare number, box and digest with the header."""
+    import laspy
+    from lazrs import LazrsError
+
     try:
         with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader:
             _check_points(reader, path)

@@ -25,7 +25,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from roadscan.core.errors import StoreError
+from roadscan.core.errors import BusyStoreError, StoreError
 from roadscan.store.holding.look import at_once
 from roadscan.store.holding.process import Process, process_lives
 
@@ -121,7 +121,7 @@ class Lease:
 
         Raises
         ------
-        StoreError
+        BusyStoreError
             where another process holds it.
         """
         self._take()
@@ -143,7 +143,7 @@ class Lease:
         if not self._lost and silent_s > LEASE_S:
             self._lost = f"its lock could not be renewed for {silent_s:.0f} s"
         if self._lost:
-            raise StoreError(
+            raise BusyStoreError(
                 f"this run lost the store: {self._lost}",
                 expected="a run that renews its lease, and reaches the store, all the time",
                 change="run again when the other run has ended: what is finished stays",
@@ -164,7 +164,7 @@ class Lease:
             _check_over(held, self._place)
             if self._place.replace(held, content):
                 return
-        raise StoreError("the store's lock changes hands all the time", change="run again", file=self._place.path)
+        raise BusyStoreError("the store's lock changes hands all the time", change="run again", file=self._place.path)
 
     def _keep(self) -> None:
         while not self._lost and not self._ended.wait(_RENEW_S):
@@ -206,8 +206,8 @@ def _check_over(held: Held, place: Place) -> None:
         )
 
 
-def _in_use(who: str, change: str) -> StoreError:
-    return StoreError(f"{who} is working on this store", expected="one run at a time", change=change)
+def _in_use(who: str, change: str) -> BusyStoreError:
+    return BusyStoreError(f"{who} is working on this store", expected="one run at a time", change=change)
 
 
 def _awake_s() -> float:

@@ -10,10 +10,10 @@ from typing import ClassVar, Generic, TypeVar
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.core.errors import DamagedError
+from roadscan.core.errors import StoreError
 from roadscan.store.codecs.choice import LIBRARY
 from roadscan.store.codecs.parquet.page_file import DamageError, PageFile, read_footer
-from roadscan.store.damage import ROWS_CHANGE, UNREADABLE
+from roadscan.store.damage import ROWS_CHANGE, UNREADABLE, unread
 from roadscan.store.readings.byte_source import opened
 from roadscan.store.store import Store
 
@@ -84,10 +84,6 @@ class GroupReader(ABC, Generic[Rows, Pages]):
         file = pq.ParquetFile(self._source.stream, metadata=self._metadata, page_checksum_verification=True)
         return file.read_row_groups(list(groups), columns=list(self.columns), use_threads=False)
 
-    def _error(self, error: Exception, groups: Sequence[int] = ()) -> DamagedError:
-        return DamagedError(
-            f"ingested {self.what} cannot be read ({error})",
-            change=ROWS_CHANGE,
-            file=self._file,
-            record=f"row groups {', '.join(map(str, groups))}" if groups else None,
-        )
+    def _error(self, error: Exception, groups: Sequence[int] = ()) -> StoreError:
+        record = f"row groups {', '.join(map(str, groups))}" if groups else None
+        return unread(f"ingested {self.what} cannot be read", error, self._file, ROWS_CHANGE, record)

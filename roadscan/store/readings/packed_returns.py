@@ -17,7 +17,6 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.compute.kernel_options import read_only
-from roadscan.store.codecs.parquet.number_table import write_number_table
 from roadscan.store.readings.kernels.firings import SLOTS, BeamTable, Packed, Turned, positions
 from roadscan.store.schema import TableSchema, table_schema
 
@@ -158,6 +157,8 @@ def write_packed_returns(path: Path, rows: pa.Table, group_rows: int) -> None:
         boxes.append([[float(values.min()), float(values.max())] for values in own])
     about = {BEAMS: beams.encoded(), _BOXES: json.dumps(boxes, separators=(",", ":")).encode()}
     runs = [c.name for c in table_schema(PACKED).columns if c.encoding == "RLE_DICTIONARY"]
+    from roadscan.store.codecs.parquet.number_table import write_number_table
+
     write_number_table(path, rows.replace_schema_metadata(about), group_rows, runs)
 
 

@@ -17,7 +17,7 @@ _HEADS: Final = """
 heads AS (
   SELECT r.* RENAME (intensity AS digital), b.* EXCLUDE (slot, log), rate_rad_per_ns * after_ns AS angle,
     sin(radians(head * 0.01::DOUBLE))::FLOAT AS head_sine, cos(radians(head * 0.01::DOUBLE))::FLOAT AS head_cosine
-  FROM packed_returns AS r JOIN beams AS b USING (log, slot)),
+  FROM {packed} AS r JOIN {beams} AS b USING (log, slot)),
 ranges AS (
   SELECT *, (angle * (1.0::DOUBLE - angle * angle / 6.0::DOUBLE))::FLOAT AS small_sine,
     (1.0::DOUBLE - angle * angle / 2.0::DOUBLE)::FLOAT AS small_cosine, distance::FLOAT * unit_m + extra_m AS range_m
@@ -58,10 +58,14 @@ def beams_query(files: str) -> str:
     )
 
 
-def returns_query() -> str:
-    """Return the statement that makes rows of ``returns`` of the tables ``packed_returns`` and ``beams``."""
+def returns_query(packed: str = PACKED, beams: str = "beams") -> str:
+    """Return the statement that makes rows of ``returns`` of the tables ``packed_returns`` and ``beams``.
+
+    packed, beams : what they are called, or statements in brackets that read them.
+    """
     own = [c.name for c in table_schema("returns").columns]
     stored = [c.name for c in (*table_schema(PACKED).columns, *table_schema("beams").columns)]
     rest = dict.fromkeys([*(name for name in stored if name != "intensity"), *_BETWEEN])
     columns = ",\n  ".join(f"{_COMPUTED[name]} AS {name}" if name in _COMPUTED else name for name in own)
-    return f"WITH {_HEADS.strip()}\nSELECT {columns},\n  * EXCLUDE ({', '.join(rest)})\nFROM aimed"
+    heads = _HEADS.strip().format(packed=packed, beams=beams)
+    return f"WITH {heads}\nSELECT {columns},\n  * EXCLUDE ({', '.join(rest)})\nFROM aimed"

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import ClassVar, Final, Literal, cast
+from typing import TYPE_CHECKING, ClassVar, Final, Literal, cast
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field
-from rasterio.transform import Affine
 
 from roadscan.core.strict import Strict
 from roadscan.store.codecs.cog import Band, dense_image, write_cog
@@ -16,6 +15,9 @@ from roadscan.store.codecs.tiff import check_cog
 from roadscan.surface.tile import EMPTY, SurfaceTile
 from roadscan.tiles.product import ProductContext, SurfaceProduct
 from roadscan.tiles.products.raster import about, height_unit
+
+if TYPE_CHECKING:
+    from rasterio.transform import Affine
 
 SurfaceBand = Literal["height", "raw_height", "origin", "intensity"]
 Float32 = npt.NDArray[np.float32]
@@ -108,6 +110,8 @@ def _reduced(band: Float32, factor: int, best: bool) -> Float32:
 
 def _place(surface: SurfaceTile, context: ProductContext) -> Affine:
     """Returns the map position, in the CRS's unit, of a (column, row) counted from the north-west corner."""
+    from rasterio.transform import Affine
+
     box, unit_m = surface.window.grown(-surface.halo).bounds(), context.map.horizontal_unit_m
     east, north = (edge / unit_m for edge in surface.cell_m)
     return Affine(east, 0.0, box.easting_min_m / unit_m, 0.0, -north, box.northing_max_m / unit_m)

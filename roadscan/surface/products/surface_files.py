@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
-from rasterio.errors import RasterioError
-from rasterio.io import MemoryFile
-from rasterio.windows import Window
 
 from roadscan.core.errors import ConfigError, StoreError
 from roadscan.core.grid import Bounds
@@ -20,6 +17,9 @@ from roadscan.surface.products.surface import SurfaceBand, SurfaceOptions, surfa
 from roadscan.surface.window import GridWindow
 from roadscan.tiles.product import LoadCells, ProductContext
 from roadscan.tiles.products.raster import CellBox
+
+if TYPE_CHECKING:
+    from rasterio.windows import Window
 
 READS: Final = ("surface",)
 
@@ -82,6 +82,9 @@ class SurfaceFiles:
         StoreError
             if the file is not one of this surface.
         """
+        from rasterio.errors import RasterioError
+        from rasterio.io import MemoryFile
+
         content = self.load.file(READS[0], tile)
         if content is None:
             return None
@@ -120,6 +123,8 @@ class SurfaceFiles:
 
     def _border(self, other: TileId, right: int, up: int, around: npt.NDArray[np.float64]) -> None:
         """Copy the pixels of a neighbour that touch a tile into its rim."""
+        from rasterio.windows import Window
+
         size = surface_box((other,), self.context)
         column, width = {-1: (size.width - 1, 1), 0: (0, size.width), 1: (0, 1)}[right]
         row, height = {1: (size.height - 1, 1), 0: (0, size.height), -1: (0, 1)}[up]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, Final, NamedTuple
 
-import laspy
 import numpy as np
 import numpy.typing as npt
 
@@ -41,6 +40,8 @@ def layout_of(frame: MapFrame, *, coloured: bool) -> Layout:
 
 def records_of(points: TilePoints, lattice: Lattice) -> npt.NDArray[np.void]:
     """Return (n,) records of format 7 of a tile's points; without colours these are black."""
+    import laspy
+
     size, frame = lattice.grid.size_quanta, lattice.map
     units = (frame.horizontal_unit_m, frame.horizontal_unit_m, frame.vertical_unit_m)
     corners = (points.tile.column * size, points.tile.row * size, 0)

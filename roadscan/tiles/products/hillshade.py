@@ -12,7 +12,6 @@ from typing import Any, ClassVar, Final, Protocol, cast
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field
-from rasterio.windows import Window
 
 from roadscan.core.ids import TileId
 from roadscan.core.strict import Strict
@@ -238,6 +237,8 @@ def base_below(tiles: Sequence[TileSummary], output: Output) -> float:
 def _write_sheet(
     sheet: Sheet, surface: Surface, options: HillshadeOptions, context: ProductContext, path: Path
 ) -> None:
+    from rasterio.windows import Window
+
     box = CellBox.around(sheet.tiles, context.grid)
     shaded = SparseRaster(box, SHADE_BAND, "uint8", _EMPTY, context)
     with raster_settings(), shaded.cog(path) as raster, _heights(surface, box, context, path) as heights:

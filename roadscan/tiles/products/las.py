@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, Final, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Final, cast
 
-import laspy
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field
@@ -20,6 +19,9 @@ from roadscan.georeference.cloud import TilePoints
 from roadscan.store.codecs.las import ONE_OF_ONE, Layout, check_points, write_points
 from roadscan.tiles.product import Cells, ProductContext, Tile, TileProduct
 from roadscan.tiles.products.las_axes import Axes, axis, rounding_errors, set_coordinates
+
+if TYPE_CHECKING:
+    import laspy
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -211,6 +213,8 @@ def _further(points: TilePoints) -> list[str]:
 
 
 def _record(points: TilePoints, axes: Axes, header: laspy.LasHeader) -> Any:
+    import laspy
+
     record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
     set_coordinates(record, axes)
     fill_record(record, points)

@@ -7,13 +7,10 @@ import functools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import numpy.typing as npt
-import rasterio
-from rasterio.transform import Affine
-from rasterio.windows import Window
 
 from roadscan.core.crs import MapFrame
 from roadscan.core.grid import QUANTA_PER_M, TileGrid
@@ -21,6 +18,10 @@ from roadscan.core.ids import TileId
 from roadscan.store.codecs.cog import BLOCK, About, Band, write_sparse_cog
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.product import ProductContext
+
+if TYPE_CHECKING:
+    from rasterio.transform import Affine
+    from rasterio.windows import Window
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,8 @@ class CellBox:
 
     def transform(self, context: ProductContext) -> Affine:
         """Return the transform from (column, row) from the north-west corner to the map, in the CRS's unit."""
+        from rasterio.transform import Affine
+
         if self.edges_m is not None:
             unit_m, (east, north) = context.map.horizontal_unit_m, self.edges_m
             return Affine(
@@ -74,6 +77,8 @@ class CellBox:
 
     def block(self, column: int, row: int) -> Window:
         """Return the window of a block by its column and row, counted from the north-west."""
+        from rasterio.windows import Window
+
         left, top = column * BLOCK, row * BLOCK
         return Window(left, top, min(BLOCK, self.width - left), min(BLOCK, self.height - top))
 
@@ -108,6 +113,8 @@ def cell_image(cells: TileCells, values: npt.NDArray[Any], dtype: str) -> npt.ND
 
 def paste_tile(raster: Any, box: CellBox, tile: TileId, image: npt.NDArray[Any]) -> None:
     """Write a tile's (rows, columns) image into the first band of `raster`, as far as `box` reaches."""
+    from rasterio.windows import Window
+
     edge = image.shape[0]
     left, top = tile.column * edge - box.west, box.north - (tile.row + 1) * edge
     x0, x1, y0, y1 = box.tile_window(tile, edge)
@@ -141,6 +148,8 @@ class SparseRaster:
         Overviews halve the raster until it is small; each of their pixels is the mean of those below it that hold a
         value. The same pixels give the same bytes.
         """
+        import rasterio
+
         scratch = path.with_name(path.name + ".scratch")
         try:
             with self._create(scratch) as raster:
@@ -160,6 +169,8 @@ class SparseRaster:
 
     @contextlib.contextmanager
     def _create(self, path: Path) -> Iterator[Any]:
+        import rasterio
+
         layout = {"tiled": True, "blockxsize": BLOCK, "blockysize": BLOCK, "sparse_ok": True, "bigtiff": "IF_SAFER"}
         profile = {
             "driver": "GTiff",

@@ -10,8 +10,6 @@ from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
-import rasterio
-from rasterio.shutil import copy as translate
 
 from roadscan.store.codecs.gdal import raster_settings, without_place_warning
 
@@ -58,6 +56,8 @@ class MeanPixels:
 
 def write_picture(path: Path, grey: npt.NDArray[np.uint8]) -> None:
     """Write (rows, columns) of grey as a PNG in which 0 is transparent."""
+    from rasterio.shutil import copy as translate
+
     opaque = np.where(grey == _EMPTY, 0, 255).astype(np.uint8)
     with raster_settings(), without_place_warning(), _in_memory(grey, opaque) as picture:
         translate(picture, str(path), driver="PNG", zlevel=6)
@@ -65,6 +65,8 @@ def write_picture(path: Path, grey: npt.NDArray[np.uint8]) -> None:
 
 @contextmanager
 def _in_memory(*bands: npt.NDArray[np.uint8]) -> Iterator[Any]:
+    import rasterio
+
     rows, columns = bands[0].shape
     with rasterio.open(
         "picture", "w+", driver="MEM", width=columns, height=rows, count=len(bands), dtype="uint8"

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.store.codecs.kernels.delta_packing import FAULTS, WHOLE, decode
 from roadscan.store.codecs.parquet import pages
 from roadscan.store.codecs.parquet.page_file import DamageError, PageFile
 
@@ -26,6 +25,8 @@ class ListTableFile(PageFile):
 
     def lists(self, name: str, values: Array) -> bool:
         """Write a loaded column of lists to (n, m) `values`; return False, without writing, where a list is null."""
+        from roadscan.store.codecs.kernels.delta_packing import FAULTS, WHOLE, decode
+
         chunk = self._chunks[name]
         data, at, end, _ = self.page(name, pages.DELTA_BINARY_PACKED)
         rows, size = values.shape

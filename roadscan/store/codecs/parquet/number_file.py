@@ -9,8 +9,6 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.store.codecs.kernels.byte_planes import join, join_low
-from roadscan.store.codecs.kernels.delta_packing import FAULTS, SLACK_BYTES, WHOLE, decode
 from roadscan.store.codecs.kernels.run_lengths import LONGEST_RUN_BYTES, decode_runs
 from roadscan.store.codecs.parquet import pages
 from roadscan.store.codecs.parquet.page_file import DamageError, PageFile
@@ -41,6 +39,8 @@ class NumberFile(PageFile):
 
     def numbers(self, name: str, values: Array) -> None:
         """Write a loaded column to (n,) `values` of the column's type."""
+        from roadscan.store.codecs.kernels.byte_planes import join, join_low
+
         encoding = _ENCODINGS.get(self.encoding(name), -1)
         data, at, end, size = self.page(name, encoding)
         if not 0 <= size <= _most_bytes(values.size):
@@ -89,6 +89,8 @@ class NumberFile(PageFile):
         return known, np.frombuffer(self._codec.decompress(data[page_at:page_end], page_size), np.uint8)
 
     def _differences(self, name: str, page: Bytes, values: Array) -> None:
+        from roadscan.store.codecs.kernels.delta_packing import FAULTS, SLACK_BYTES, WHOLE, decode
+
         words = -(-(page.size + SLACK_BYTES) // _WORD)
         if self._unpacked.size < words:
             self._unpacked = np.empty(words, np.uint64)

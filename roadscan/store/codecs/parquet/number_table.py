@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -17,14 +17,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.store.codecs.choice import LIBRARY
-from roadscan.store.codecs.kernels.byte_planes import split, split_rounded
-from roadscan.store.codecs.kernels.delta_packing import BLOCK, MINIBLOCKS
-from roadscan.store.codecs.kernels.delta_packing_int64 import TOO_FAR, encode_long, room_words
 from roadscan.store.codecs.kernels.run_lengths import LONGEST_RUN_BYTES, encode_runs
 from roadscan.store.codecs.parquet import pages
-from roadscan.store.codecs.parquet.list_table import KINDS, Packed, Writer
+from roadscan.store.codecs.parquet.list_table import KINDS, Writer
 from roadscan.store.codecs.parquet.pages import bit_packed
 from roadscan.store.codecs.parquet.thrift import Value, binary, i64, struct, varint, zigzag
+
+if TYPE_CHECKING:
+    from roadscan.store.codecs.parquet.list_table import Packed
 
 _SCRATCH: Final = 2048  # values of the scratch line that the kernels need
 
@@ -35,6 +35,8 @@ Columns = Mapping[str, Array]
 
 def is_number_table(schema: pa.Schema) -> bool:
     """Return True if all columns are of non-null numbers."""
+    from roadscan.store.codecs.parquet.list_table import KINDS
+
     return all(field.type in KINDS and not field.nullable for field in schema)
 
 
@@ -120,6 +122,9 @@ class _Numbers(Writer):
         return self.with_dictionary(field, dictionary, known.size, self.pack(page), values.size, more)
 
     def _differences(self, values: Array) -> tuple[int, Bytes]:
+        from roadscan.store.codecs.kernels.delta_packing import BLOCK, MINIBLOCKS
+        from roadscan.store.codecs.kernels.delta_packing_int64 import TOO_FAR, encode_long, room_words
+
         if self._room.size < room_words(values.size):
             self._room = np.empty(room_words(values.size), np.uint64)
         packed = encode_long(np.ascontiguousarray(values), self._room)
@@ -130,6 +135,9 @@ class _Numbers(Writer):
         return pages.DELTA_BINARY_PACKED, content
 
     def _split(self, field: pa.Field, values: Array, step: float | None) -> Bytes:
+        from roadscan.store.codecs.kernels.byte_planes import split, split_rounded
+        from roadscan.store.codecs.parquet.list_table import KINDS
+
         width = np.dtype(KINDS[field.type].stored).itemsize
         if self._planes.size < width * values.size:
             self._planes = np.empty(width * values.size, np.uint8)

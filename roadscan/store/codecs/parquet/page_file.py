@@ -13,9 +13,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.store.codecs.kernels.delta_packing import SLACK_BYTES
 from roadscan.store.codecs.parquet import pages
-from roadscan.store.codecs.parquet.list_table import MAGIC, sealed
 from roadscan.store.codecs.zlib_stream import crc32
 
 TAIL_BYTES: Final = 8
@@ -57,6 +55,8 @@ class _Chunk:
 
 def read_footer(stream: Any) -> tuple[pq.FileMetaData, bool]:
     """Return the footer of a Parquet file, and whether `list_table` wrote it; DamageError where it is damaged."""
+    from roadscan.store.codecs.parquet.list_table import MAGIC, sealed
+
     size = stream.seek(0, os.SEEK_END)
     tail = _read(stream, max(size - _FOOTER_BYTES, 0), size)
     length = int.from_bytes(tail[-TAIL_BYTES:-4], "little")
@@ -104,6 +104,8 @@ class PageFile:
 
     def load(self, group: int, names: Sequence[str]) -> None:
         """Read columns of a row group into the buffer."""
+        from roadscan.store.codecs.kernels.delta_packing import SLACK_BYTES
+
         self._chunks = {name: self._located(group, name) for name in names}
         self._origin, end = _span(self._chunks.values())
         words = -(-(end - self._origin + SLACK_BYTES) // _WORD)

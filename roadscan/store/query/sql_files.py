@@ -12,36 +12,36 @@ import io
 import os
 import stat
 import threading
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Protocol
 
 from fsspec import AbstractFileSystem
 
+from roadscan.store.stamp import Stamp, stamp_of_info, stamp_of_stat
 from roadscan.store.store import Store
 
 PROTOCOL: Final = "store"
 
 
-class Stamp(NamedTuple):
-    """Size and time that show, without reading it, that a file has not been written since."""
-
-    bytes: int
-    changed: str
-    """Time of the last change (ns) in a folder; an object store's equivalent, empty where it has none."""
-
-
-def stamp_of(store: Store, path: str) -> Stamp | None:
-    """Return size and time of a file of the store (`path` relative to the survey's root), None where it is missing."""
-    try:
-        if store.is_folder:
-            return _stamp_of_stat(os.stat(store.path(path)))  # noqa: PTH116 — thousands of them
-        return _remote_stamp(store.fs.info(store.path(path)))
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-
-
 def url(store: Store, path: str) -> str:
     """Return the name of a file of the store in statements."""
     return f"{PROTOCOL}://survey={store.survey_id}/{path}"
+
+
+class OpenedFiles(Protocol):
+    """What a connection opens and what it was denied."""
+
+    @property
+    def refused(self) -> list[str]:
+        """Denied requests, in words."""
+        ...
+
+    def last(self) -> str | None:
+        """Return the file that was opened last."""
+        ...
+
+    def forget(self) -> None:
+        """Count no file as opened by now."""
+        ...
 
 
 class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
@@ -56,7 +56,7 @@ class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
 
     def __init__(self, store: Store) -> None:
         super().__init__()
-        self.store = store
+        self._store = store
         self._top = f"survey={store.survey_id}"
         self._root = os.path.realpath(store.root) if store.is_folder else None
         self._inside: set[str] = set()
@@ -64,8 +64,20 @@ class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
         self._alone = threading.Lock()  # DuckDB opens files from several threads
         self.opened: dict[str, Stamp] = {}
         """Opened files, relative to the survey's root, with their stamps at that time."""
-        self.refused: list[str] = []
+        self._refused: list[str] = []
+
+    @property
+    def refused(self) -> list[str]:
         """Denied requests, in words."""
+        return self._refused
+
+    def last(self) -> str | None:
+        """Return the file that was opened last."""
+        return next(reversed(self.opened), None)
+
+    def forget(self) -> None:
+        """Count no file as opened by now."""
+        self.opened.clear()
 
     def open(self, path: str, mode: str = "rb", **_: Any) -> Any:
         """Return a file's bytes; PermissionError for any other mode and for files outside."""
@@ -77,8 +89,8 @@ class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
             stream = _LocalFile(place)
             stamp = stream.stamp()
         else:
-            stamp = _remote_stamp(self.store.fs.info(place))
-            stream = _RemoteFile(self.store.fs.open(place, "rb"), stamp.bytes)
+            stamp = stamp_of_info(self._store.fs.info(place))
+            stream = _RemoteFile(self._store.fs.open(place, "rb"), stamp.bytes)
         with self._alone:
             self.opened.setdefault(self._relative(path), stamp)
         return stream
@@ -90,7 +102,7 @@ class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
             local = os.stat(place)  # noqa: PTH116 — thousands of them
             kind = "directory" if stat.S_ISDIR(local.st_mode) else "file"
             return {"name": self._strip_protocol(path), "size": local.st_size, "type": kind}
-        found = self.store.fs.info(place)
+        found = self._store.fs.info(place)
         return {"name": self._strip_protocol(path), "size": found["size"], "type": found["type"]}
 
     def modified(self, path: str) -> Any:
@@ -98,12 +110,12 @@ class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
         place = self._place(path)
         if self._root is not None:
             return dt.datetime.fromtimestamp(os.stat(place).st_mtime, dt.UTC)  # noqa: PTH116 — thousands of them
-        return self.store.fs.modified(place)
+        return self._store.fs.modified(place)
 
     def ls(self, path: str, detail: bool = True, **_: Any) -> list[Any]:
         """Return the entries of a folder, without links that lead outside."""
         found = []
-        for entry in self.store.fs.ls(self._place(path), detail=True):
+        for entry in self._store.fs.ls(self._place(path), detail=True):
             name = f"{self._strip_protocol(path).rstrip('/')}/{str(entry['name']).rstrip('/').rsplit('/', 1)[1]}"
             found.append({"name": name, "size": entry["size"], "type": entry["type"]})
         return found if detail else [one["name"] for one in found]
@@ -124,10 +136,10 @@ class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
 
     def _place(self, path: str) -> str:
         """Return the path in the store's file system; PermissionError outside of the survey's folder."""
-        place = self.store.path(self._relative(path))
+        place = self._store.path(self._relative(path))
         if self._root is not None:
             folder = place.rsplit("/", 1)[0]
-            known = folder in self._inside or place == self.store.root or self._leads_inside(folder)
+            known = folder in self._inside or place == self._store.root or self._leads_inside(folder)
             if not known or (os.path.islink(place) and not self._leads_inside(place)):  # noqa: PTH114 — thousands
                 self._refuse(f"{path} is a link that leads out of the store")
             self._inside.add(folder)
@@ -138,7 +150,7 @@ class StoreFiles(AbstractFileSystem):  # type: ignore[misc]
         return real == self._root or real.startswith(f"{self._root}/")
 
     def _refuse(self, words: str) -> None:
-        self.refused.append(words)
+        self._refused.append(words)
         raise PermissionError(words)
 
 
@@ -151,7 +163,7 @@ class _LocalFile(io.RawIOBase):
 
     def stamp(self) -> Stamp:
         """Return size and time of the open file."""
-        return _stamp_of_stat(os.fstat(self._file))
+        return stamp_of_stat(os.fstat(self._file))
 
     def readable(self) -> bool:
         """Return True."""
@@ -213,12 +225,3 @@ class _RemoteFile(_LocalFile):
 
     def _release(self) -> None:
         self._stream.close()
-
-
-def _stamp_of_stat(found: os.stat_result) -> Stamp:
-    return Stamp(found.st_size, str(found.st_mtime_ns))
-
-
-def _remote_stamp(found: dict[str, Any]) -> Stamp:
-    known = (found.get(name) for name in ("ETag", "etag", "md5Hash", "LastModified", "mtime", "updated", "created"))
-    return Stamp(int(found["size"]), str(next((one for one in known if one), "")))

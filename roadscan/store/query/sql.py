@@ -6,31 +6,29 @@ import contextlib
 import re
 import tempfile
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
 
 import duckdb
 import pyarrow as pa
 
-from roadscan.core.errors import RoadscanError, StoreError
+from roadscan.core.errors import AnswerError, RoadscanError, StoreError
 from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, leap_second_steps
 from roadscan.store.asset_schema import ASSET_FOLDER, asset_tables
-from roadscan.store.logs import DataFile, log_of, read_log_records, table_of
+from roadscan.store.logs import log_of, read_log_records, table_of
 from roadscan.store.manifest import Manifest
+from roadscan.store.query.sql_files import PROTOCOL, OpenedFiles, StoreFiles, url
 from roadscan.store.readings.packed_returns import PACKED
 from roadscan.store.readings.packed_view import beams_query, returns_query
 from roadscan.store.schema import schema_names, table_schema
-from roadscan.store.sql_files import PROTOCOL, StoreFiles, url
 from roadscan.store.store import Store
 from roadscan.store.verified import faults_of_opened, recorded_files
 
-_PER_TILE = ("cells", "overviews")
+PER_TILE = ("cells", "overviews")
 _MISTAKES = (duckdb.CatalogException, duckdb.BinderException, duckdb.ParserException)
 """Errors of the statement."""
-_ROWS: Final = "unpacked_returns"
-"""View of the files of `returns` beside packed ones."""
-_ALWAYS = ("rejects",)
+ALWAYS = ("rejects",)
 """Tables that exist before they have a row: an empty table of rejects is an answer, too."""
 _MISSING = re.compile(r"Table (?:Function )?with name \"?(?P<name>\w+)\"? does not exist")
 """DuckDB's message for a missing table or table macro."""
@@ -80,12 +78,34 @@ class Opened:
     """A connection, and the sources of its views."""
 
     connection: duckdb.DuckDBPyConnection
-    files: StoreFiles
+    files: OpenedFiles
     """The files that it opens."""
-    recorded: pa.Table
-    """Their records."""
+    faults: Callable[[], list[AnswerError]]
+    """Returns the faults of those that were opened."""
     shut: dict[str, StoreError]
     """Tables whose files cannot be opened, and why."""
+
+
+class Stores(Protocol):
+    """Several stores that one statement reaches (:class:`roadscan.store.query.sql_fleet.FleetStores`)."""
+
+    def with_views(self, connection: duckdb.DuckDBPyConnection, damaged: list[StoreError] | None) -> Opened:
+        """Add the views of their tables to a connection."""
+        ...
+
+
+@dataclass(frozen=True)
+class Tables:
+    """The files of a store's tables, by table: names in statements."""
+
+    of_logs: dict[str, list[str]]
+    """Tables of rows of logs; Hive columns come with each row."""
+    made: dict[str, list[str]]
+    """Tables that a run made."""
+    outputs: pa.Table
+    """Records of all outputs."""
+    recorded: pa.Table
+    """Records of all files."""
 
 
 def connect(
@@ -114,11 +134,18 @@ def connect(
 
 
 def _opened(
-    store: Store, logs: Iterable[str] | None, damaged: list[StoreError] | None, unconfined: bool, limits: Limits
+    store: Store | Stores,
+    logs: Iterable[str] | None,
+    damaged: list[StoreError] | None,
+    unconfined: bool,
+    limits: Limits,
 ) -> Opened:
     connection = duckdb.connect()
     try:
-        opened = _with_views(connection, store, logs, damaged)
+        if isinstance(store, Store):
+            opened = _with_views(connection, store, logs, damaged)
+        else:
+            opened = store.with_views(connection, damaged)
         connection.execute(f"SET memory_limit = '{limits.memory_words()}'")
         connection.execute(f"SET max_temp_directory_size = '{_SPILT * _memory_bytes(connection)}B'")
         for setting in (*_NO_EXTENSIONS, *(() if unconfined else _CONFINED)):
@@ -126,8 +153,42 @@ def _opened(
     except BaseException:
         connection.close()
         raise
-    opened.files.opened.clear()  # a view reads the first file of its table
+    opened.files.forget()  # a view reads the first file of its table
     return opened
+
+
+def tables_of(store: Store, logs: Iterable[str] | None, damaged: list[StoreError] | None) -> Tables:
+    """Return the files of a store's tables; `logs` are the keys of those to show, all where None."""
+    of_logs: dict[str, list[str]] = {}
+    wanted = None if logs is None else set(logs)
+    records = read_log_records(store, damaged=damaged)
+    for record in records:
+        if wanted is not None and record.key not in wanted:
+            continue  # replaced by a newer version of the log, or no longer listed
+        for file in (file for own in record.tables.values() for file in own):
+            of_logs.setdefault(table_of(file.path), []).append(url(store, file.path))
+    manifest = Manifest(store, damaged)
+    places = {name: location for name in schema_names() if (location := table_schema(name).location) is not None}
+    made_of = {name: store.files(folder, ".parquet") for name, folder in places.items()}
+    assets = store.files(ASSET_FOLDER, ".parquet")
+    made_of |= {name: [path] for name in asset_tables() if (path := f"{ASSET_FOLDER}/{name}.parquet") in assets}
+    made = {name: [url(store, f) for f in found] for name, found in made_of.items() if found}
+    return Tables(of_logs, made, manifest.table(), recorded_files(store, records, manifest))
+
+
+def statements_of(of_logs: Mapping[str, list[str]]) -> dict[str, str]:
+    """Return what reads each table of logs, by its name: packed returns are rows of `returns` as well.
+
+    of_logs : URLs of files by the form of their rows.
+    """
+    found = {form: rows_of(urls, hive=True) for form, urls in of_logs.items()}
+    if PACKED in of_logs:
+        one_a_log = {log_of(one): one for one in of_logs[PACKED]}
+        found["beams"] = beams_query(_listed(one_a_log.values()))
+        others = f"{found['returns']} UNION ALL BY NAME " if "returns" in of_logs else ""
+        own = returns_query(packed=f"({found[PACKED]})", beams=f"({found['beams']})")
+        found["returns"] = f"{others}({own})"
+    return found
 
 
 def _with_views(
@@ -135,48 +196,40 @@ def _with_views(
 ) -> Opened:
     own_files = StoreFiles(store)
     connection.register_filesystem(own_files)
-    _add_utc(connection)
-    files: dict[str, list[DataFile]] = {}
+    add_utc(connection)
     shut: dict[str, StoreError] = {}
-    wanted = None if logs is None else set(logs)
-    records = read_log_records(store, damaged=damaged)
-    for record in records:
-        if wanted is not None and record.key not in wanted:
-            continue  # replaced by a newer version of the log, or no longer listed
-        for table, own in record.tables.items():
-            files.setdefault(table, []).extend(own)
-    for table, held in files.items():
-        partition_s = table_schema(table).partition_s
-        fault = _log_view(connection, own_files, table, held, damaged)
+    tables = tables_of(store, logs, damaged)
+    for table, rows in statements_of(tables.of_logs).items():
+        fault = add_view(connection, own_files, table, rows, damaged)
         if fault is not None:
             shut[table] = fault
-        elif partition_s is not None:
-            connection.execute(
-                f"CREATE MACRO {table}_between(first_gps_ns, last_gps_ns) AS TABLE SELECT * FROM {table} "
-                f"WHERE gps_bin_s BETWEEN first_gps_ns // 1000000000 // {partition_s} * {partition_s} "
-                "AND last_gps_ns // 1000000000 "
-                "AND epoch_gps_ns BETWEEN first_gps_ns AND last_gps_ns"
-            )
-    for table in _ALWAYS:
-        if table not in files:
+        else:
+            add_span_macro(connection, table)
+    for table in ALWAYS:
+        if table not in tables.of_logs:
             connection.register(table, table_schema(table).arrow().empty_table())
-    manifest = Manifest(store, damaged)
-    made = manifest.table()  # except its files: a later record replaces an earlier one
-    if made.num_rows:
-        connection.register("outputs", made)
-    places = {name: location for name in schema_names() if (location := table_schema(name).location) is not None}
-    made_of = {name: store.files(folder, ".parquet") for name, folder in places.items()}
-    assets = store.files(ASSET_FOLDER, ".parquet")
-    made_of |= {name: [path] for name in asset_tables() if (path := f"{ASSET_FOLDER}/{name}.parquet") in assets}
-    for name, found in made_of.items():
-        urls = [url(store, f) for f in found]
-        if found and (fault := _view(connection, own_files, name, urls, damaged, filename=name in _PER_TILE)):
+    if tables.outputs.num_rows:  # except its files: a later record replaces an earlier one
+        connection.register("outputs", tables.outputs)
+    for name, urls in tables.made.items():
+        if fault := add_view(connection, own_files, name, rows_of(urls, filename=name in PER_TILE), damaged):
             shut[name] = fault
-    return Opened(connection, own_files, recorded_files(store, records, manifest), shut)
+    return Opened(connection, own_files, lambda: faults_of_opened(store, own_files.opened, tables.recorded), shut)
+
+
+def add_span_macro(connection: duckdb.DuckDBPyConnection, table: str) -> None:
+    """Add ``TABLE_between(first_gps_ns, last_gps_ns)`` of a table that has partitions in time."""
+    partition_s = table_schema(table).partition_s
+    if partition_s is not None:
+        connection.execute(
+            f"CREATE MACRO {table}_between(first_gps_ns, last_gps_ns) AS TABLE SELECT * FROM {table} "
+            f"WHERE gps_bin_s BETWEEN first_gps_ns // 1000000000 // {partition_s} * {partition_s} "
+            "AND last_gps_ns // 1000000000 "
+            "AND epoch_gps_ns BETWEEN first_gps_ns AND last_gps_ns"
+        )
 
 
 def query(
-    store: Store,
+    store: Store | Stores,
     statement: str,
     logs: Iterable[str] | None = None,
     damaged: list[StoreError] | None = None,
@@ -206,13 +259,13 @@ def query(
             raise _too_long(limits) from None
         except duckdb.Error as error:
             if damaged is not None:
-                damaged += faults_of_opened(store, opened.files.opened, opened.recorded)
+                damaged += opened.faults()
                 fault = opened.shut.get((missing_table(error) or "").removesuffix("_between"))
                 if fault is not None:  # the table was made, and cannot be shown
                     damaged.remove(fault)
                     raise fault from None
             raise _in_words(error, opened.files) from error
-    faults = faults_of_opened(store, opened.files.opened, opened.recorded)
+    faults = opened.faults()
     if faults and damaged is None:
         raise faults[0]
     if damaged is not None:
@@ -267,7 +320,7 @@ def _memory_bytes(connection: duckdb.DuckDBPyConnection) -> int:
     return int(float(number) * 1024 ** ("bytes", "KiB", "MiB", "GiB", "TiB", "PiB").index(unit))
 
 
-def _in_words(error: duckdb.Error, files: StoreFiles) -> RoadscanError:
+def _in_words(error: duckdb.Error, files: OpenedFiles) -> RoadscanError:
     """Return a statement's error, or its denied access, as an error of roadscan."""
     if files.refused:
         return RoadscanError(f"the query was refused: {files.refused[-1]}", change=_WAY_OUT_OF_STORE)
@@ -315,7 +368,7 @@ def missing_table(error: BaseException | None) -> str | None:
     return None if found is None else found["name"]
 
 
-def _add_utc(connection: duckdb.DuckDBPyConnection) -> None:
+def add_utc(connection: duckdb.DuckDBPyConnection) -> None:
     """Add ``utc(epoch_gps_ns)``: the UTC instant of a GPS epoch, with its zone, truncated to microseconds."""
     steps = sorted(leap_second_steps(), reverse=True)
     leaps = " ".join(f"WHEN epoch_gps_ns >= {first}000000000 THEN {count}" for first, count in steps)
@@ -324,58 +377,35 @@ def _add_utc(connection: duckdb.DuckDBPyConnection) -> None:
     connection.execute(f"CREATE MACRO utc(epoch_gps_ns) AS make_timestamptz({micros})")
 
 
-def _view(
-    connection: duckdb.DuckDBPyConnection,
-    files: StoreFiles,
-    name: str,
-    urls: list[str],
-    damaged: list[StoreError] | None,
-    *,
-    hive: bool = False,
-    filename: bool = False,
-) -> StoreError | None:
-    """Create a view of some files; where that fails, add the error to `damaged` and return it."""
-    files.opened.clear()
+def rows_of(urls: list[str], *, hive: bool = False, filename: bool = False) -> str:
+    """Return the statement that reads all rows of some files."""
     options = "hive_partitioning = true, hive_types_autocast = true" if hive else "hive_partitioning = false"
     if filename:
         options += ", filename = true"
+    return f"SELECT * FROM read_parquet({_listed(urls)}, {options})"
+
+
+def add_view(
+    connection: duckdb.DuckDBPyConnection,
+    files: OpenedFiles,
+    name: str,
+    rows: str,
+    damaged: list[StoreError] | None,
+) -> StoreError | None:
+    """Create a view of what a statement reads; where that fails, add the error to `damaged` and return it."""
+    files.forget()
     try:
-        connection.execute(f"CREATE VIEW {name} AS SELECT * FROM read_parquet({_listed(urls)}, {options})")
+        connection.execute(f"CREATE VIEW {name} AS {rows}")
     except duckdb.Error as error:
         fault = StoreError(
             f"table '{name}' cannot be opened: {_reason(error)}",
             change="`roadscan verify` finds damaged files and says what to do",
-            file=next(reversed(files.opened), None),
+            file=files.last(),
         )
         if damaged is None:
             raise fault from error
         damaged.append(fault)
         return fault
-    return None
-
-
-def _log_view(
-    connection: duckdb.DuckDBPyConnection,
-    files: StoreFiles,
-    table: str,
-    held: list[DataFile],
-    damaged: list[StoreError] | None,
-) -> StoreError | None:
-    """Create the view of a table's rows of logs, in each form in which its files hold them; faults as of `_view`."""
-    paths: dict[str, list[str]] = {}
-    for file in held:
-        paths.setdefault(table_of(file.path), []).append(file.path)
-    urls = {form: [url(files.store, path) for path in found] for form, found in paths.items()}
-    if PACKED not in urls:
-        return _view(connection, files, table, urls[table], damaged, hive=True)
-    for form, name in ((PACKED, PACKED), (table, _ROWS)):
-        fault = _view(connection, files, name, urls[form], damaged, hive=True) if form in urls else None
-        if fault is not None:
-            return fault
-    one_a_log = {log_of(path): one for path, one in zip(paths[PACKED], urls[PACKED], strict=True)}
-    connection.execute(f"CREATE VIEW beams AS {beams_query(_listed(one_a_log.values()))}")
-    rows = f"SELECT * FROM {_ROWS} UNION ALL BY NAME " if table in urls else ""
-    connection.execute(f"CREATE VIEW {table} AS {rows}({returns_query()})")
     return None
 
 

@@ -1,0 +1,65 @@
+"""Installs automations in the Prefect server: ``python -m roadscan.flows.automations FILE --notify BLOCK``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import typer
+import yaml
+from prefect.client.orchestration import get_client
+from prefect.events.schemas.automations import AutomationCore
+from prefect.exceptions import ObjectNotFound
+
+from roadscan.core.errors import ConfigError
+
+_NOTIFY = "NOTIFY"
+"""In the file, in place of the id of the block that sends messages: the server gives the id."""
+
+
+async def install(file: Path, notify: str | None) -> list[str]:
+    """Create each automation of the file, or bring the one of its name up to date; return the names.
+
+    Parameters
+    ----------
+    notify : block that sends messages, `TYPE/NAME`; without it, automations that need one are left out.
+
+    Raises
+    ------
+    ConfigError
+        where the server has no such block.
+    """
+    asked: list[dict[str, Any]] = yaml.safe_load(file.read_text(encoding="utf-8"))["automations"]
+    done = []
+    async with get_client() as client:
+        if notify is not None:
+            kind, _, name = notify.partition("/")
+            try:
+                block = await client.read_block_document_by_name(name, kind)
+            except ObjectNotFound:
+                raise ConfigError(f"the server has no block {notify}", expected="TYPE/NAME of a saved block") from None
+            asked = json.loads(json.dumps(asked).replace(f'"{_NOTIFY}"', f'"{block.id}"'))
+        for one in asked:
+            if f'"{_NOTIFY}"' in json.dumps(one):
+                continue
+            wanted = AutomationCore.model_validate(one)
+            known = await client.read_automations_by_name(wanted.name)
+            if known:
+                await client.update_automation(known[0].id, wanted)
+            else:
+                await client.create_automation(wanted)
+            done.append(wanted.name)
+    return done
+
+
+if __name__ == "__main__":
+    import asyncio
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--notify", help="block that sends messages, TYPE/NAME")
+    arguments = parser.parse_args()
+    for installed in asyncio.run(install(arguments.file, arguments.notify)):
+        typer.echo(f"installed: {installed}")

@@ -1,0 +1,1 @@
+"""Many surveys: a catalogue of them, and questions to all of them at once."""

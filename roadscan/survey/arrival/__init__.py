@@ -1,0 +1,1 @@
+"""How a folder of raw logs becomes a survey without a person: watched, complete, answered by a fleet's template."""

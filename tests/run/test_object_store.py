@@ -54,7 +54,7 @@ class Breaking(Remembering):
     break_off: Exception | None = None
 
     def _open(self, path: str, mode: str = "rb", *arguments: Any, **options: Any) -> Any:
-        if mode == "rb" and "/tables/returns/" in path and Breaking.break_off is not None:
+        if mode == "rb" and "/tables/packed_returns/" in path and Breaking.break_off is not None:
             raise Breaking.break_off
         return super()._open(path, mode, *arguments, **options)
 

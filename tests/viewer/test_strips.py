@@ -102,7 +102,9 @@ def test_a_long_lane_is_fetched_in_full_where_people_look(open_page: Any, long_a
         read.wait_for()
         assert f" to {value_at(1234.5):.4f}" in read.inner_text() and "in 10.0" in read.inner_text()
         # Zoom in by dragging over some 240 m around the cursor.
-        plot = page.locator(".strips .u-over").bounding_box()
+        over = page.locator(".strips .u-over")
+        over.hover()  # waits until it moves no more
+        plot = over.bounding_box()
         middle = plot["x"] + plot["width"] * 1234.5 / LONG_M
         reach, height = plot["width"] * 120.0 / LONG_M, plot["y"] + plot["height"] / 2
         page.mouse.move(middle - reach, height)

@@ -101,7 +101,8 @@ def test_units_are_the_logs_and_the_tiles(told: Simulated, events: list[dict[str
 def test_bytes_written_are_those_of_the_files(told: Simulated, events: list[dict[str, Any]]) -> None:
     """Sizes as the file system states them; a stage writes records of the manifest beside its files, too."""
     store = told.store()
-    for stage, folders in (("ingest", ("tables/packed_returns", "tables/scans", "tables/trajectory")), ("tiles", ("tiles",))):
+    ingested = tuple(f"tables/{name}" for name in ("packed_returns", "scans", "trajectory"))
+    for stage, folders in (("ingest", ingested), ("tiles", ("tiles",))):
         size = sum(Path(store.path(path)).stat().st_size for folder in folders for path in store.files(folder))
         (ended,) = of(events, "stage_ended", stage)
         assert size <= ended["bytes_written"] < size + 300_000, stage

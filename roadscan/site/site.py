@@ -123,7 +123,7 @@ def publish(material: Material, out: Path, report: Callable[[int, int], None] = 
         _exchange(scratch, out)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-    left_out = site_layers(material)[1]
+    left_out = (*site_layers(material)[1], *_lost_report(material))
     return Published(out, len(writer.keys), writer.made, writer.bytes, tuple(writer.failures), left_out, tuple(damaged))
 
 
@@ -217,6 +217,14 @@ def _exchange(scratch: Path, out: Path) -> None:
 def _report(material: Material) -> Any:
     record = material.session.manifest.get(REPORT, REPORT)
     return record if record is not None and material.store.exists(record.path) else None
+
+
+def _lost_report(material: Material) -> list[str]:
+    """Return what is wrong with a report that was written and is not there any more."""
+    record = material.session.manifest.get(REPORT, REPORT)
+    if record is None or _report(material) is not None:
+        return []
+    return [f"{material.store.path(record.path)} is missing: `roadscan report` writes it again"]
 
 
 def _crs(frame: MapFrame) -> dict[str, Any]:

@@ -47,6 +47,7 @@ from roadscan.site.parts.edits import Edits
 from roadscan.site.parts.features import Features
 from roadscan.site.parts.rasters import images_of
 from roadscan.site.parts.strips import Strips
+from roadscan.site.report_copy import REPORT
 from roadscan.site.single import write_single
 from roadscan.site.site import KEYS, Published, entry, publish
 from roadscan.site.site_rasters import Place, Raster, coarser_picture
@@ -724,6 +725,18 @@ def test_a_large_layer_is_cut_into_sheets(survey_file: Path, monkeypatch: pytest
     coarse.write(tmp_path / "coarse.json", Path)
     features = json.loads((tmp_path / "coarse.json").read_text())["features"]
     assert [one["properties"] for one in features] == [{"state": "done"}] * layer["features"]
+
+
+def test_a_report_that_is_lost_is_told(survey_file: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "survey"
+    shutil.copytree(survey_file.parent, copy)
+    session = opened(copy / survey_file.name)
+    assert not publish(Material(session), tmp_path / "site").left_out
+    record = session.manifest.get(REPORT, REPORT)
+    assert record is not None
+    session.store.remove(record.path)
+    (told,) = publish(Material(opened(copy / survey_file.name)), tmp_path / "site").left_out
+    assert "report.html is missing: `roadscan report` writes it again" in told
 
 
 def test_the_inventory_is_shown_and_edited(survey_file: Path, tmp_path: Path) -> None:

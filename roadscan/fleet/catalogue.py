@@ -24,7 +24,7 @@ TABLE: Final = "fleet"
 FOLDER: Final = "fleet"
 """Folder of the catalogue, within that of the surveys."""
 _FILE: Final = "surveys.parquet"
-PAGE: Final = "index.html"
+_PAGE: Final = "index.html"
 _STAC: Final = "1.1.0"
 
 
@@ -69,7 +69,7 @@ def make_catalogue(place: str) -> Catalogue:
     for name, item in items.items():
         put_file(fs, f"{base}/items/{name}.json", _json(item))
     put_file(fs, f"{base}/collection.json", _json(_collection(rows, sorted(items))))
-    put_file(fs, f"{base}/{PAGE}", fleet_page(rows).encode())
+    put_file(fs, f"{base}/{_PAGE}", fleet_page(rows).encode())
     for path in fs.glob(f"{base}/items/*.json"):
         if path.rsplit("/", 1)[1].removesuffix(".json") not in items:
             fs.rm_file(path)

@@ -90,19 +90,8 @@ def _years(rows: Sequence[Row]) -> Part:
 
 
 def _surveys(rows: Sequence[Row]) -> Part:
-    head = (
-        "survey",
-        "title",
-        "state",
-        "from",
-        "rig",
-        "km",
-        "lane km",
-        "σ height (mm)",
-        "MRI (m/km)",
-        "version",
-        "store",
-    )
+    figures = ("km", "lane km", "σ height (mm)", "MRI (m/km)")
+    head = ("survey", "title", "state", "from", "rig", *figures, "version")
     told = [
         [
             str(one["survey"]), str(one["title"]), str(one["state"]), _day(one.get("first_epoch_gps_ns")),

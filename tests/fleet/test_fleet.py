@@ -209,6 +209,7 @@ class Tables(HTMLParser):
 def test_the_page_says_the_same_as_the_catalogue(fleet: Path, tmp_path: Path) -> None:
     told = Tables((fleet / "fleet/index.html").read_text()).of
     asked = list(csv.DictReader(io.StringIO(cli("sql", "--fleet", str(fleet), "--csv", YEARLY).output)))
+    assert all(len(row) == len(rows[0]) for rows in told.values() for row in rows)  # a cell a column
     assert [(row[0], row[1]) for row in told["years"][1:]] == [("2025", "1"), ("2026", "1")]
     for row, one in zip(told["years"][1:], asked, strict=True):
         assert float(row[4]) == pytest.approx(float(one["mri"]), abs=0.006)

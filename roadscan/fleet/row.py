@@ -22,14 +22,13 @@ from roadscan.store.digest import bytes_hold
 from roadscan.store.history import last_run
 from roadscan.store.logs import DataFile, LogRecord, read_log_records
 from roadscan.store.manifest import Manifest, is_changing, read_failures, read_recorded
+from roadscan.store.stamp import stamp_of_info
 from roadscan.store.store import Store
 
 FORM: Final = 1
 """Number of the way in which a row is made: another one makes all rows anew."""
 _PASSING: Final = ("manifest/verified.parquet", "manifest/sources", "manifest/lock", "manifest/lease")
 """Beginnings of files of the manifest that say nothing of a survey; reading it may write the first two."""
-_STAMPS: Final = ("ETag", "etag", "mtime", "LastModified")
-"""What a file system says of a file that changes with it; the first that it says counts."""
 _POSITION: Final = ("x_world_m", "y_world_m", "z_world_m")
 _SECOND_NS: Final = 1_000_000_000
 """A length is taken between one pose a second (ns), so that noise of 200 poses a second does not lengthen it."""
@@ -69,9 +68,7 @@ def row_key(found: Found, notes: Sequence[str]) -> str:
     listed = store.fs.find(folder, detail=True) if store.exists("manifest") else {}
     start = len(store.fs._strip_protocol(store.root)) + 1
     files = sorted(
-        (path[start:], one["size"], str(next((one[name] for name in _STAMPS if name in one), "")))
-        for path, one in listed.items()
-        if not path[start:].startswith(_PASSING)
+        (path[start:], *stamp_of_info(one)) for path, one in listed.items() if not path[start:].startswith(_PASSING)
     )
     survey = found.survey
     stated = None if survey is None else [survey.config.model_dump(mode="json"), survey.rig.name]

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from roadscan.store.store import Store
+
+_MARKS: Final = ("ETag", "etag", "md5Hash", "LastModified", "last_modified", "mtime", "updated", "created")
+"""What changes with a file's content, by the names that S3, Azure and Google, and file systems give it."""
 
 
 class Stamp(NamedTuple):
@@ -33,5 +36,4 @@ def stamp_of_stat(found: os.stat_result) -> Stamp:
 
 def stamp_of_info(found: dict[str, Any]) -> Stamp:
     """Return size and time of an object from what its file system tells of it (`fsspec`'s `info`)."""
-    known = (found.get(name) for name in ("ETag", "etag", "md5Hash", "LastModified", "mtime", "updated", "created"))
-    return Stamp(int(found["size"]), str(next((one for one in known if one), "")))
+    return Stamp(int(found["size"]), str(next((found[name] for name in _MARKS if found.get(name)), "")))

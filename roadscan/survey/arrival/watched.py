@@ -20,14 +20,13 @@ from roadscan.core.errors import ChangingLogError, ConfigError, StoreError
 from roadscan.ingest.inspect.diagnosis import formats_of
 from roadscan.ingest.inspect.first_survey import candidates
 from roadscan.store.checked_json import checked_json, parse_checked
+from roadscan.store.stamp import Stamp, stamp_of_info
 from roadscan.survey.arrival.template import FleetTemplate
 
 RECORDS: Final = ".arrivals"
 """Folder of the records below the folder of surveys: one file a folder that was seen."""
 _SOUND: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 """Names that a survey's id can have."""
-_MARKS: Final = ("ETag", "etag", "md5Hash", "last_modified", "mtime")
-"""What changes with a file's content, by the names that S3, Azure and Google, and file systems give it."""
 _TOLD: Final = 5
 """Most files that a reason names."""
 
@@ -49,9 +48,9 @@ class Record:
 
 @dataclass(frozen=True)
 class Listing:
-    """The files of a folder: size (bytes) and a mark that changes with the content, by name."""
+    """The files of a folder by name: size and a mark that changes with the content."""
 
-    files: Mapping[str, tuple[int, str]]
+    files: Mapping[str, Stamp]
 
     @property
     def digest(self) -> str:
@@ -92,10 +91,7 @@ class Watched:
         top = f"{self.root}/{name}/"
         with self._answering():
             found = self.fs.find(top, detail=True)
-        files = {
-            path.removeprefix(top): (int(info["size"]), str(next((info[key] for key in _MARKS if info.get(key)), "")))
-            for path, info in found.items()
-        }
+        files = {path.removeprefix(top): stamp_of_info(info) for path, info in found.items()}
         return Listing({n: v for n, v in files.items() if not any(p.startswith(".") for p in n.split("/")) and n})
 
     def look(self, name: str, template: FleetTemplate, now_s: float) -> tuple[Record, bool]:

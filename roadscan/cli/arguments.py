@@ -68,6 +68,28 @@ def _is_survey(file: Path) -> bool:
     return isinstance(values.get("runs"), list) and "map" in values
 
 
+def span_gps_ns(span: str) -> tuple[int, int]:
+    """First and last GPS time of ``START/END``, two times with a zone.
+
+    Raises
+    ------
+    ConfigError
+        It is not two times.
+    TimeSystemError
+        One has no zone.
+    """
+    import datetime as dt
+
+    from roadscan.core.errors import ConfigError
+    from roadscan.core.gpstime import gps_ns_from_utc
+
+    try:
+        start, end = (dt.datetime.fromisoformat(part) for part in span.split("/"))
+    except ValueError:
+        raise ConfigError(f"--span {span}", expected="START/END, such as 2026-05-04T09:30:00Z/…") from None
+    return gps_ns_from_utc(start), gps_ns_from_utc(end)
+
+
 def surveys_for(incomplete: str) -> list[str]:
     """TOML files whose names begin so; without any, the shell completes files in its own way."""
     folder, _, begun = incomplete.rpartition("/")

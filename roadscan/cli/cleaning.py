@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from roadscan.cli.arguments import SurveyFile
+from roadscan.cli.arguments import SurveyFile, span_gps_ns
 from roadscan.cli.terminal import new_reporter, print_table
 
 _DAY_S = 86_400.0
@@ -108,7 +108,6 @@ def forget(
     """Remove pictures for people's privacy: their files and their copies in archives. It cannot be undone."""
     from roadscan.core.counted import counted
     from roadscan.core.errors import ConfigError
-    from roadscan.door import gps_ns_of
     from roadscan.run.session import Session
     from roadscan.survey.forget import choose_named, choose_taken
     from roadscan.survey.forget import forget as let_go
@@ -117,13 +116,13 @@ def forget(
     if not names and camera is None and not archive:
         expected = "--picture, --list, or --camera with --span; --archive alone takes those that went before"
         raise ConfigError("no picture is named", expected=expected)
-    if span and (camera is None or span.count("/") != 1):
-        raise ConfigError(f"the span '{span}'", expected="START/END, and --camera RUN/CAMERA")
+    if span and camera is None:
+        raise ConfigError(f"the span '{span}' without a camera", expected="START/END, and --camera RUN/CAMERA")
+    first, last = span_gps_ns(span) if span else (None, None)
     session = Session.open(survey_file)
     with session.store.lock():
         chosen = choose_named(session, names)
         if camera is not None:
-            first, last = map(gps_ns_of, span.split("/")) if span else (None, None)
             chosen += choose_taken(session, camera, first, last)
         chosen = list(dict.fromkeys(chosen))
         if remove and (chosen or archive):

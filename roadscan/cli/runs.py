@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from roadscan.cli.arguments import USUAL, AsJson, Dashboard, Scheduler, SurveyFile, Workers, options_apart, surveys_for
+from roadscan.cli.arguments import (
+    USUAL,
+    AsJson,
+    Dashboard,
+    Scheduler,
+    SurveyFile,
+    Workers,
+    options_apart,
+    span_gps_ns,
+    surveys_for,
+)
 from roadscan.cli.state import plan
 from roadscan.cli.survey import Where, run_and_sum_up, run_survey, sum_up
 from roadscan.cli.terminal import print_json, print_table
@@ -181,10 +191,7 @@ def reprocess(
 
 def selected(tiles: list[str] | None, bbox: str | None, span: str | None) -> Selection:
     """The selection of tiles that the options state."""
-    import datetime as dt
-
     from roadscan.core.errors import ConfigError
-    from roadscan.core.gpstime import gps_ns_from_utc
     from roadscan.core.grid import Bounds
     from roadscan.core.ids import TileId
     from roadscan.run.selection import Selection
@@ -197,9 +204,5 @@ def selected(tiles: list[str] | None, bbox: str | None, span: str | None) -> Sel
             raise ConfigError(f"--bbox {bbox}", expected="WEST,SOUTH,EAST,NORTH in metres") from None
         box = Bounds(west, south, east, north)
     if span is not None:
-        try:
-            start, end = (dt.datetime.fromisoformat(part) for part in span.split("/"))
-        except ValueError:
-            raise ConfigError(f"--span {span}", expected="START/END, such as 2026-05-04T09:30:00Z/…") from None
-        times = (gps_ns_from_utc(start), gps_ns_from_utc(end))
+        times = span_gps_ns(span)
     return Selection(tuple(TileId.parse(t) for t in tiles or ()), box, times)

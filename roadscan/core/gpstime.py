@@ -115,6 +115,11 @@ def iso_from_gps_ns(epoch_gps_ns: int) -> str:
     return utc_from_gps_ns(epoch_gps_ns).isoformat().replace("+00:00", "Z")
 
 
+def now_utc(timespec: str = "seconds") -> str:
+    """Return the current instant (UTC) as ISO 8601, to the second or as `datetime.isoformat` knows `timespec`."""
+    return dt.datetime.now(dt.UTC).isoformat(timespec=timespec).replace("+00:00", "Z")
+
+
 def gps_week_of_date(date: dt.date) -> int:
     """GPS week that a calendar day (UTC) lies in."""
     return (date - dt.date(1980, 1, 6)).days // 7

@@ -243,8 +243,8 @@ class OpenSurvey:
         where = [f"{c} = '{_quoted(v)}'" for c, v in (("run", run), ("sensor", sensor)) if v is not None]
         source = f'"{name}"'
         if start is not None or end is not None:
-            first = gps_ns_of(start) if start is not None else 0
-            last = gps_ns_of(end) - 1 if end is not None else 2**62
+            first = _gps_ns(start) if start is not None else 0
+            last = _gps_ns(end) - 1 if end is not None else 2**62
             if last < first - 1:
                 raise ConfigError(f"the span ends ({end}) before it starts ({start})", expected="start before end")
             source = f"{name}_between({first}, {last})"
@@ -278,7 +278,7 @@ class OpenSurvey:
         from roadscan.door.extracts import poses_on_map
 
         self._check_run(run)
-        limits = (gps_ns_of(start) if start is not None else None, gps_ns_of(end) if end is not None else None)
+        limits = (_gps_ns(start) if start is not None else None, _gps_ns(end) if end is not None else None)
         return poses_on_map(self.session, run, *limits)
 
     def cells(self, *, bbox: Box | None = None, tile: str | None = None) -> xr.Dataset:
@@ -572,14 +572,7 @@ def _clock(stated: Clock | Mapping[str, Any] | str | None) -> Clock | None:
     return ClockConfig.parse(dict(stated)).clock()
 
 
-def gps_ns_of(instant: Instant) -> int:
-    """Return an instant in GPS nanoseconds.
-
-    Raises
-    ------
-    ConfigError
-        where it is none, or has no zone.
-    """
+def _gps_ns(instant: Instant) -> int:
     from roadscan.core.gpstime import gps_ns_from_utc
 
     if isinstance(instant, int | np.integer):

@@ -15,6 +15,7 @@ import pyarrow.compute as pc
 
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.extras import needed
+from roadscan.core.gpstime import now_utc
 from roadscan.core.witness import Finding
 from roadscan.inventory.changes import EpochChanges, epoch_changes
 from roadscan.inventory.checks import faults_of
@@ -25,7 +26,7 @@ from roadscan.inventory.edits import Edit, edit_rows
 from roadscan.inventory.history import Event, history_of
 from roadscan.inventory.home import FID, Author, Content, EditFault, Home, HomeError, Mark, Sheet
 from roadscan.inventory.homes.page_edits import EditOutcome, PageDocument, PageEdits
-from roadscan.inventory.pulling import Pulling, clocked, new_edits, now_utc, refuse
+from roadscan.inventory.pulling import Pulling, clocked, new_edits, refuse
 from roadscan.inventory.qgis.project import Raster, Source, project_text
 from roadscan.inventory.recording import Found, Rules, record
 from roadscan.inventory.state import State, commit_at, live_commits, state_at

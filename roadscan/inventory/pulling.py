@@ -162,11 +162,6 @@ def _rejection(key: tuple[str, str], known: Edit | None, pulling: Pulling) -> Ed
     return next((one for one in rejections if one is not None and one.new == REJECTED), None)
 
 
-def now_utc() -> str:
-    """Returns the current instant (UTC), ISO 8601 to the second."""
-    return dt.datetime.now(dt.UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
-
-
 def refuse(faults: Sequence[EditFault], home: str) -> FaultyEditsError:
     """Returns the error that names all faulty rows of a home."""
     listed = "; ".join(str(fault) for fault in faults[:20])

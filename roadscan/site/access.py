@@ -6,7 +6,6 @@ adds who asked as headers. A secret that only proxy and server know shows that a
 
 from __future__ import annotations
 
-import datetime as dt
 import hmac
 import json
 import os
@@ -17,6 +16,7 @@ from typing import Final, Literal, NamedTuple, Self
 from urllib.parse import urlsplit
 
 from roadscan.core.errors import ConfigError, in_words
+from roadscan.core.gpstime import now_utc
 from roadscan.core.strict import Strict, load_toml
 
 SECRET_VARIABLE: Final = "ROADSCAN_PROXY_SECRET"
@@ -135,8 +135,8 @@ class Access(Strict):
         """
         if self.audit is None:
             return
-        at = dt.datetime.now(dt.UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
         name, role = ("", "none") if asker is None else asker
+        at = now_utc("milliseconds")
         line = json.dumps({"at": at, "who": name, "role": role, "path": path, "outcome": outcome}, ensure_ascii=False)
         try:
             with self.audit.open("ab", buffering=0) as stream:  # one write a line: lines of two servers do not mix

@@ -6,7 +6,6 @@ what `roadscan clean` removes.
 
 from __future__ import annotations
 
-import datetime as dt
 import getpass
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from roadscan.core.errors import ConfigError, RoadscanError, nearest
+from roadscan.core.gpstime import now_utc
 from roadscan.ingest.planned_logs import PlannedLog, logs_of
 from roadscan.ingest.sources import listed_name
 from roadscan.navigation.tasks.taken_pictures import taken_pictures
@@ -120,8 +120,7 @@ def forget(session: Session, chosen: Collection[Chosen], why: str, archives: Seq
     why : the reason, for the record; archives : folders or URLs of archives.
     """
     folder = session.survey.folder
-    at = dt.datetime.now(dt.UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
-    who, known = getpass.getuser(), forgotten_pictures(session.store)
+    at, who, known = now_utc(), getpass.getuser(), forgotten_pictures(session.store)
     paths = {one: listed_name(one.path, folder) for one in chosen}
     new = [Forgotten(one.run, one.camera, path, at, who, why) for one, path in paths.items()]
     opened = [(archive, archive.files()) for archive in (Archive.of(url, session) for url in archives)]

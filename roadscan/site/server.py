@@ -141,11 +141,9 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse_method()
             return
         asker = self._asker()
-        audit = self.server.access if door.writes else None
+        refused = self._refused(door, asker)
         try:
-            refused = self._refused(door, asker)
-            if audit is not None:
-                audit.note(asker, self.path, "received" if refused is None else f"refused: {refused[1]}")
+            self._note(door, asker, "received" if refused is None else f"refused: {refused[1]}")
         except RoadscanError as error:
             self._text(HTTPStatus.INTERNAL_SERVER_ERROR, f"the audit cannot be kept: {error}")
             return
@@ -156,11 +154,11 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             answer = door.answer(content, asker.name if asker else "")
         except RoadscanError as error:
-            self._told(audit, asker, f"refused: {error}")
+            self._told(door, asker, f"refused: {error}")
             self._text(HTTPStatus.UNPROCESSABLE_ENTITY, str(error))
             return
         commit = answer.get("commit")
-        self._told(audit, asker, "taken" if commit is None else f"taken: commit {commit}")
+        self._told(door, asker, "taken" if commit is None else f"taken: commit {commit}")
         told = json_bytes(answer)
         self._head(HTTPStatus.OK, "answer.json", {"Content-Length": str(len(told))})
         self.wfile.write(told)
@@ -172,11 +170,15 @@ class _Handler(BaseHTTPRequestHandler):
             return Asker("", "editor") if named else None
         return self.server.access.asker(self.headers, self.server.secret)
 
-    def _told(self, audit: Access | None, asker: Asker | None, outcome: str) -> None:
+    def _note(self, door: Door, asker: Asker | None, outcome: str) -> None:
+        """Tell the audit of a document that is to change files; RoadscanError where it cannot be written."""
+        if door.writes and self.server.access is not None:
+            self.server.access.note(asker, self.path, outcome)
+
+    def _told(self, door: Door, asker: Asker | None, outcome: str) -> None:
         """Tell the audit what became of a document, and standard error where the audit cannot be written any more."""
         try:
-            if audit is not None:
-                audit.note(asker, self.path, outcome)
+            self._note(door, asker, outcome)
         except RoadscanError as error:
             sys.stderr.write(f"roadscan: the audit cannot be kept: {error}; {outcome}\n")
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -19,12 +19,8 @@ import pyarrow.parquet as pq
 from roadscan.store.codecs.choice import LIBRARY
 from roadscan.store.codecs.kernels.run_lengths import LONGEST_RUN_BYTES, encode_runs
 from roadscan.store.codecs.parquet import pages
-from roadscan.store.codecs.parquet.list_table import KINDS, Writer
-from roadscan.store.codecs.parquet.pages import bit_packed
+from roadscan.store.codecs.parquet.list_table import KINDS, Packed, Writer
 from roadscan.store.codecs.parquet.thrift import Value, binary, i64, struct, varint, zigzag
-
-if TYPE_CHECKING:
-    from roadscan.store.codecs.parquet.list_table import Packed
 
 _SCRATCH: Final = 2048  # values of the scratch line that the kernels need
 
@@ -35,8 +31,6 @@ Columns = Mapping[str, Array]
 
 def is_number_table(schema: pa.Schema) -> bool:
     """Return True if all columns are of non-null numbers."""
-    from roadscan.store.codecs.parquet.list_table import KINDS
-
     return all(field.type in KINDS and not field.nullable for field in schema)
 
 
@@ -136,7 +130,6 @@ class _Numbers(Writer):
 
     def _split(self, field: pa.Field, values: Array, step: float | None) -> Bytes:
         from roadscan.store.codecs.kernels.byte_planes import split, split_rounded
-        from roadscan.store.codecs.parquet.list_table import KINDS
 
         width = np.dtype(KINDS[field.type].stored).itemsize
         if self._planes.size < width * values.size:
@@ -162,7 +155,7 @@ def _as_runs(values: Array) -> tuple[Array, Bytes]:
 
 def _as_bytes(values: Array) -> tuple[Array, Bytes]:
     """Return all bytes up to the largest, and the page of indices of 8 bits, which are the values (n,) themselves."""
-    head = np.frombuffer(bytes([8]) + bit_packed(values.size), np.uint8)
+    head = np.frombuffer(bytes([8]) + pages.bit_packed(values.size), np.uint8)
     fill = np.zeros(-values.size % 8, np.uint8)
     return np.arange(int(values.max(initial=0)) + 1), np.concatenate([head, values, fill])
 

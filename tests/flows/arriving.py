@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -15,6 +14,7 @@ from typing import Any
 from roadscan.flows.arrival import arrival
 from roadscan.flows.watch import watch
 from roadscan.simulate import SimulatedSurvey
+from tests.serving import serving
 
 FLEET = """
 rig = "RIG.toml"
@@ -113,11 +113,5 @@ class Mailbox:
 def open_mailbox() -> Iterator[Mailbox]:
     """One that is open for as long as the context lasts."""
     box = Mailbox()
-    thread = threading.Thread(target=box.server.serve_forever)
-    thread.start()
-    try:
+    with serving(box.server):
         yield box
-    finally:
-        box.server.shutdown()
-        thread.join()
-        box.server.server_close()

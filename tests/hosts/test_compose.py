@@ -5,7 +5,6 @@ from __future__ import annotations
 import http.server
 import json
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -30,6 +29,7 @@ from tests.flows.test_deployment import log_of, planned_runs
 from tests.hosts.composed import Composed, eventually, interpolated
 from tests.hosts.conftest import assert_same, contents
 from tests.hosts.host import NETWORK, network
+from tests.serving import serving
 from tests.surveys import Simulated
 
 SETTINGS = {
@@ -110,14 +110,8 @@ class Alerts(http.server.BaseHTTPRequestHandler):
 @contextmanager
 def alerts() -> Iterator[str]:
     """Where alerts are taken, on the address of this process in the network of the tests."""
-    with http.server.ThreadingHTTPServer((f"{NETWORK}.1", 0), Alerts) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            yield f"http://{NETWORK}.1:{server.server_port}/"
-        finally:
-            server.shutdown()
-            thread.join()
+    with serving(http.server.ThreadingHTTPServer((f"{NETWORK}.1", 0), Alerts)) as server:
+        yield f"http://{NETWORK}.1:{server.server_port}/"
 
 
 @pytest.fixture

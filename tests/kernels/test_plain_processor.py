@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+import roadscan
+
 HERE = Path(__file__).resolve().parents[2]
 AVX2 = {
     "NUMBA_CPU_NAME": "haswell",
@@ -84,3 +86,11 @@ def test_libraries_compute_the_same_last_bits_on_a_plain_processor() -> None:
     assert found["roadscan"] == found["plain"]
     if "avx512f" in Path("/proc/cpuinfo").read_text():
         assert found["bare"] != found["plain"]  # otherwise the settings would not be needed
+
+
+@pytest.mark.parametrize("file", ["deploy/Containerfile", "deploy/systemd/roadscan.env", "deploy/slurm/cluster.py"])
+def test_services_begin_with_what_roadscan_sets(file: str) -> None:
+    """Dask's own workers import NumPy before roadscan: their environment has to hold it."""
+    text = (HERE / file).read_text()
+    for name, value in (roadscan._SUMS | roadscan._WIDE).items():
+        assert f"{name}={value}" in text

@@ -10,7 +10,6 @@ import pickle
 import re
 import shutil
 import socket
-import threading
 from collections import Counter
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -32,6 +31,7 @@ from roadscan.store.history import history_faults
 from roadscan.store.query.sql import query
 from roadscan.store.store import Store
 from tests.conftest import REPOSITORY
+from tests.serving import serving
 from tests.surveys import Simulated, outputs
 
 ALL_STAGES = [
@@ -299,13 +299,9 @@ class _Taken(BaseHTTPRequestHandler):
 
 @pytest.fixture
 def collector(monkeypatch: pytest.MonkeyPatch) -> Iterator[Collector]:
-    with Collector() as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
+    with serving(Collector()) as server:
         monkeypatch.setenv("OTEL_EXPORTER_OTLP_ENDPOINT", f"http://127.0.0.1:{server.server_port}")
         yield server
-        server.shutdown()
-        thread.join()
 
 
 def test_a_collector_gets_the_run_as_a_trace_and_its_figures(

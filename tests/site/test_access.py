@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import http.client
 import json
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from roadscan.core.errors import ConfigError, RoadscanError
 from roadscan.site.access import Access
 from roadscan.site.live import Served
 from roadscan.site.server import Door, SiteServer
+from tests.serving import serving
 
 SECRET = "0123456789abcdef0123456789abcdef"
 FILE = """
@@ -53,12 +53,8 @@ def server(page: Page, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Itera
     monkeypatch.setenv("ROADSCAN_PROXY_SECRET", SECRET)
     file = tmp_path / "ACCESS.toml"
     file.write_text(FILE)
-    with SiteServer(page, doors={"edits": Door(page.take, writes=True)}, access=Access.load(file)) as one:
-        thread = threading.Thread(target=one.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
+    with serving(SiteServer(page, doors={"edits": Door(page.take, writes=True)}, access=Access.load(file))) as one:
         yield one
-        one.shutdown()
-        thread.join()
 
 
 def ask(
@@ -138,18 +134,12 @@ def test_everyone_may_look(page: Page, tmp_path: Path, monkeypatch: pytest.Monke
     file = tmp_path / "ACCESS.toml"
     file.write_text('address = "https://roads.example.org"\nviewers = ["*"]')
     access = Access.load(file)
-    with SiteServer(page, doors={"edits": Door(page.take, writes=True)}, access=access) as server:
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        try:
-            assert ask(server, "/page.json", *by())[0] == 200
-            assert ask(server, "/page.json")[0] == 403
-            for headers in (by(), by("ann@example.org")):
-                assert ask(server, "/edits", *headers, content=b"{}")[0] == 403
-            assert server.address == "https://roads.example.org" and not page.taken
-        finally:
-            server.shutdown()
-            thread.join()
+    with serving(SiteServer(page, doors={"edits": Door(page.take, writes=True)}, access=access)) as server:
+        assert ask(server, "/page.json", *by())[0] == 200
+        assert ask(server, "/page.json")[0] == 403
+        for headers in (by(), by("ann@example.org")):
+            assert ask(server, "/edits", *headers, content=b"{}")[0] == 403
+        assert server.address == "https://roads.example.org" and not page.taken
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import http.client
 import json
 import socket
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +13,7 @@ import pytest
 from roadscan.core.errors import StoreError
 from roadscan.site.live import LiveSite, Served, open_survey
 from roadscan.site.server import Door, SiteServer, range_of
+from tests.serving import serving
 from tests.surveys import Simulated
 
 CONTENT = bytes(range(256)) * 40
@@ -39,12 +39,8 @@ def held(tmp_path: Path) -> Held:
 
 @pytest.fixture
 def server(held: Held) -> Iterator[SiteServer]:
-    with SiteServer(held) as one:
-        thread = threading.Thread(target=one.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
+    with serving(SiteServer(held)) as one:
         yield one
-        one.shutdown()
-        thread.join()
 
 
 def ask(
@@ -84,12 +80,10 @@ def editable(held: Held) -> Iterator[SiteServer]:
         held.asked.append(content.decode())
         return {"took": content.decode()}
 
-    with SiteServer(held, doors={"edits": Door(take, writes=True), "measure": Door(take, writes=False)}) as one:
-        thread = threading.Thread(target=one.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
+    with serving(
+        SiteServer(held, doors={"edits": Door(take, writes=True), "measure": Door(take, writes=False)})
+    ) as one:
         yield one
-        one.shutdown()
-        thread.join()
 
 
 def post(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import shutil
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +14,7 @@ import pytest
 from roadscan.site.live import Served
 from roadscan.site.server import SiteServer
 from roadscan.site.web_part import DATA_MARK, single_page, web_folder
+from tests.serving import serving
 from tests.viewer.street import write_site
 
 AXE = Path(__file__).resolve().parents[2] / "viewer/node_modules/axe-core/axe.min.js"
@@ -137,12 +137,8 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def address(street: Path) -> Iterator[str]:
     """Address of the street's site."""
-    with SiteServer(FolderSite(street)) as server:
-        thread = threading.Thread(target=server.serve_forever, daemon=True)
-        thread.start()
+    with serving(SiteServer(FolderSite(street))) as server:
         yield server.address
-        server.shutdown()
-        thread.join()
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,6 +11,7 @@ import shapely
 
 from roadscan.site.server import Door, SiteServer
 from roadscan.store.asset_schema import asset_kind_names, asset_schema
+from tests.serving import serving
 from tests.viewer.conftest import go_to, serious
 from tests.viewer.inventory_site import CRACK, POLES, EditedSite
 from tests.viewer.street import EAST_M, HOSTILE, NORTH_M
@@ -29,15 +29,11 @@ class Opened(NamedTuple):
 def opened(open_page: Any, street: Path, tmp_path: Path) -> Iterator[Opened]:
     """The page by the address that allows edits."""
     site = EditedSite(street, tmp_path)
-    with SiteServer(site, doors={"edits": Door(site.take, writes=True)}) as server:
-        thread = threading.Thread(target=server.serve_forever, daemon=True)
-        thread.start()
+    with serving(SiteServer(site, doors={"edits": Door(site.take, writes=True)})) as server:
         origin = server.address.partition("#")[0]
         with open_page(origin) as watched:
             watched.page.on("dialog", lambda one: one.accept())
             yield Opened(site, watched.open(f"{server.address}&views=map"), server)
-        server.shutdown()
-        thread.join()
 
 
 def choose(opened: Opened, number: int) -> None:

@@ -6,7 +6,6 @@ import json
 import math
 import random
 import shutil
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ import pytest
 from roadscan.site.document import json_bytes
 from roadscan.site.server import SiteServer
 from roadscan.site.web_part import web_folder
+from tests.serving import serving
 from tests.viewer.conftest import FolderSite, go_to
 from tests.viewer.network import APART_M, SOUTH_M, WEST_M, Network
 from tests.viewer.street import HOSTILE
@@ -36,12 +36,8 @@ def network(tmp_path_factory: pytest.TempPathFactory) -> Network:
 
 
 def served(documents: Any) -> Iterator[str]:
-    with SiteServer(documents) as server:
-        thread = threading.Thread(target=server.serve_forever, daemon=True)
-        thread.start()
+    with serving(SiteServer(documents)) as server:
         yield server.address
-        server.shutdown()
-        thread.join()
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +26,7 @@ from roadscan.site.material import Material, Wishes
 from roadscan.site.parts.measuring import Measuring
 from roadscan.site.server import SiteServer
 from tests.pictures.test_picture_targets import PLATES, SMALL, STREET, TARGETS
+from tests.serving import serving
 from tests.simulate.test_simulate_photogrammetry import Survey as Truth
 from tests.surveys import Simulated
 from tests.viewer.conftest import go_to, serious
@@ -87,12 +87,8 @@ def driven(tmp_path_factory: pytest.TempPathFactory, browser: Any) -> Simulated:
 def yard(driven: Simulated, tmp_path: Path) -> Iterator[Yard]:
     made = driven.copy_with_store_to(tmp_path / "survey")
     site = LiveSite(open_survey(made.survey_file, edited=True))
-    with SiteServer(site, doors=doors_of(site, made.survey_file, edited=True)) as server:
-        thread = threading.Thread(target=server.serve_forever, daemon=True)
-        thread.start()
+    with serving(SiteServer(site, doors=doors_of(site, made.survey_file, edited=True))) as server:
         yield Yard(made, server)
-        server.shutdown()
-        thread.join()
 
 
 def origin(yard: Yard) -> str:

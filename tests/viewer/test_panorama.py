@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from roadscan.simulate import simulate, truth
 from roadscan.simulate.earth import Earth
 from roadscan.site.live import LiveSite, open_survey
 from roadscan.site.server import SiteServer
+from tests.serving import serving
 from tests.surveys import Simulated, small_scene
 from tests.viewer.test_page import _look, _middle, _read
 
@@ -82,12 +82,8 @@ def driven(tmp_path_factory: pytest.TempPathFactory, browser: Any) -> Iterator[D
     ).noiseless()  # fmt: skip
     made = Simulated(simulate(scene, tmp_path_factory.mktemp("around") / "survey").survey_file)
     made.run(products__make=["tile_table"], adjust__on=False)
-    with SiteServer(LiveSite(open_survey(made.survey_file))) as server:
-        thread = threading.Thread(target=server.serve_forever, daemon=True)
-        thread.start()
+    with serving(SiteServer(LiveSite(open_survey(made.survey_file)))) as server:
         yield Driven(made.survey_file.parent, server.address)
-        server.shutdown()
-        thread.join()
 
 
 @pytest.mark.parametrize("number", [0, 1])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from roadscan.site.server import SiteServer
 from roadscan.site.web_part import web_folder
+from tests.serving import serving
 from tests.viewer.conftest import FolderSite
 from tests.viewer.recorded_street import POLE, RecordedStreet, recorded_street
 
@@ -41,12 +41,8 @@ def recorded_address(recorded: RecordedStreet) -> Iterator[str]:
     built = web_folder()
     if built is not None:
         shutil.copytree(built, recorded.site, dirs_exist_ok=True)
-    with SiteServer(FolderSite(recorded.site)) as server:
-        thread = threading.Thread(target=server.serve_forever, daemon=True)
-        thread.start()
+    with serving(SiteServer(FolderSite(recorded.site))) as server:
         yield server.address
-        server.shutdown()
-        thread.join()
 
 
 def published_pixels(recorded: RecordedStreet, places: Float64, picture: int) -> Float64:

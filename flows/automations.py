@@ -64,7 +64,7 @@ async def install(file: Path, notify: str | None) -> list[str]:
 
 
 def save_address(url: str) -> str:
-    """Save a block that posts messages to an address, and return its name; the address, which may be a key, is hidden."""
+    """Save a block that posts messages to an address; return its name. The address, which may be a key, is hidden."""
     block = CustomWebhookNotificationBlock(
         name="roadscan",
         url="{{address}}",

@@ -1,8 +1,8 @@
 """Order of events on the Prefect server, which `PREFECT_SERVER_EVENTS_CAUSAL_ORDERING=roadscan.flows.ordering` names.
 
 Prefect holds an event back until the one that it follows has come, for 15 minutes at most. Its scheduler sends no event
-of a run that it plans, so all that happens to a run which begins within five minutes of being planned was told a quarter
-of an hour late: also its death. Here an event waits 10 s.
+of a run that it plans. So what happened to a run that began within five minutes of being planned was told a quarter of
+an hour late, also its death. Here an event waits 10 s.
 """
 
 from __future__ import annotations

@@ -17,6 +17,7 @@ from prefect.blocks.notifications import CustomWebhookNotificationBlock
 from prefect.client.orchestration import get_client
 from prefect.events.schemas.automations import AutomationCore
 from prefect.exceptions import ObjectNotFound
+from prefect.types import SecretDict
 
 from roadscan.core.errors import ConfigError
 
@@ -68,8 +69,10 @@ def save_address(url: str) -> str:
     block = CustomWebhookNotificationBlock(
         name="roadscan",
         url="{{address}}",
-        secrets={"address": url},
+        secrets=SecretDict({"address": url}),
         json_data={"subject": "{{subject}}", "body": "{{body}}"},
+        headers=None,
+        cookies=None,
     )
     block.save("roadscan", overwrite=True)
     return "custom-webhook/roadscan"

@@ -11,7 +11,7 @@ from datetime import timedelta
 
 from prefect.server.events.ordering import memory
 
-memory.PRECEDING_EVENT_LOOKBACK = timedelta(seconds=10)
+memory.PRECEDING_EVENT_LOOKBACK = timedelta(seconds=10)  # type: ignore[attr-defined]
 # Events of one run come over two connections, the server's own and that of the run's process: a second apart at most.
 
 CausalOrdering = memory.CausalOrdering

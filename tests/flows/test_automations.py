@@ -10,12 +10,14 @@ from uuid import uuid4
 
 import pytest
 import yaml
+from prefect.client.orchestration import get_client
 from prefect.server.events.ordering import EventArrivedEarly, get_triggers_causal_ordering
 from prefect.server.events.schemas.automations import AutomationCore, EventTrigger
 from prefect.server.events.schemas.events import ReceivedEvent
 from prefect.settings import PREFECT_SERVER_EVENTS_CAUSAL_ORDERING, temporary_settings
 from prefect.types._datetime import now
 
+from roadscan.flows.automations import install, save_address
 from tests.conftest import REPOSITORY
 
 DEPLOY = REPOSITORY / "deploy"
@@ -63,6 +65,22 @@ def test_each_failure_is_told_once() -> None:
     assert who(happened("Failed", "arrival")) == []  # the flow's own event says why
     assert who(happened("Failed", "survey", deployed=False)) == []
     assert [who(happened("Crashed", flow)) for flow in ("survey", "arrival", "watch")] == [["run crashed"]] * 3
+
+
+@pytest.mark.usefixtures("prefect_api")
+def test_without_an_address_no_automation_sends_messages() -> None:
+    """Those that did are removed, and the address of before is not readable."""
+    file = DEPLOY / "automations.yaml"
+    block = save_address("http://127.0.0.1:9/of-a-pager")
+    assert [line.partition(": ")[0] for line in asyncio.run(install(file, block))] == ["installed"] * 9
+    with get_client(sync_client=True) as client:
+        saved = client.read_block_document_by_name("roadscan", "custom-webhook", include_secrets=False)
+        assert "pager" not in str(saved.data)
+    said = asyncio.run(install(file, None))
+    assert sum(line.startswith("removed, since no block sends messages: ") for line in said) == 5
+    with get_client(sync_client=True) as client:
+        left = {one.name for one in client.read_automations()}
+    assert left == {line.partition(": ")[2] for line in said if line.startswith("installed: ")}
 
 
 def test_an_event_does_not_wait_long_for_one_that_never_comes() -> None:

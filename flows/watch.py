@@ -9,18 +9,11 @@ from typing import Any, Literal
 
 from prefect import flow, get_run_logger
 from prefect.client.orchestration import get_client
-from prefect.client.schemas.filters import (
-    FlowRunFilter,
-    FlowRunFilterDeploymentId,
-    FlowRunFilterState,
-    FlowRunFilterStateType,
-)
-from prefect.client.schemas.objects import State, StateType
-from prefect.client.schemas.sorting import FlowRunSort
+from prefect.client.schemas.objects import State
 from prefect.deployments import run_deployment
 from prefect.events import emit_event
 from prefect.exceptions import ObjectNotFound
-from prefect.states import Completed, Scheduled
+from prefect.states import Completed
 from prefect.utilities.hashing import hash_objects
 
 from roadscan.core.errors import ConfigError, RoadscanError
@@ -29,9 +22,6 @@ from roadscan.survey.arrival.template import FleetTemplate
 from roadscan.survey.arrival.watched import Record, Watched
 
 What = Literal["arrived", "refused", "changed", "published", "failed"]
-
-RESUMES = 3
-"""Most times that a run whose process died is resumed: one that needs more memory than there is dies each time."""
 
 
 def tell(what: What, survey: str, **payload: Any) -> None:
@@ -44,8 +34,6 @@ def tell(what: What, survey: str, **payload: Any) -> None:
 def watch(watched: str, fleet: str, surveys: str = ".", deployment: str = "arrival/fleet") -> State[Any]:
     """Look at each folder once: start a run for one that is complete, name one that is refused, leave others.
 
-    Runs whose process died are resumed.
-
     Parameters
     ----------
     watched : folder or URL of a bucket; each folder in it is a survey's raw logs.
@@ -55,7 +43,7 @@ def watch(watched: str, fleet: str, surveys: str = ".", deployment: str = "arriv
 
     Returns
     -------
-    Names of folders by what became of them: `started`, `refused`, `changed`, `resumed`.
+    Names of folders by what became of them: `started`, `refused`, `changed`.
 
     Raises
     ------
@@ -64,12 +52,12 @@ def watch(watched: str, fleet: str, surveys: str = ".", deployment: str = "arriv
         looked at; all others were.
     """
     log = get_run_logger()
-    new: dict[str, list[str]] = {"started": [], "refused": [], "changed": [], "resumed": []}
+    new: dict[str, list[str]] = {"started": [], "refused": [], "changed": []}
     faults: list[RoadscanError] = []
     try:
         place, template = Watched(watched, Path(surveys)), FleetTemplate.load(Path(fleet))
         names = place.names()
-        new["resumed"] += _resumed(deployment)
+        _check_deployed(deployment)
     except RoadscanError as error:
         return failed(error)
     parameters = {"watched": watched, "fleet": fleet, "surveys": surveys}
@@ -114,23 +102,13 @@ def _start(deployment: str, template: FleetTemplate, name: str, found: Record, p
     tell("arrived", name, flow_run=str(run.id))
 
 
-def _resumed(deployment: str) -> list[str]:
-    """Schedule runs again that crashed: their process, its worker or their machine died. Return the folders."""
-    names = []
+def _check_deployed(deployment: str) -> None:
+    """Raise ConfigError where the server has no such deployment."""
     with get_client(sync_client=True) as client:
         try:
-            of_deployment = FlowRunFilterDeploymentId(any_=[client.read_deployment_by_name(deployment).id])
+            client.read_deployment_by_name(deployment)
         except ObjectNotFound:
             raise ConfigError(
                 f"the server has no deployment {deployment}",
                 change="prefect deploy --all --prefect-file deploy/arrival.yaml",
             ) from None
-        crashed = FlowRunFilterState(type=FlowRunFilterStateType(any_=[StateType.CRASHED]))
-        found = FlowRunFilter(deployment_id=of_deployment, state=crashed)
-        for run in client.read_flow_runs(flow_run_filter=found, sort=FlowRunSort.START_TIME_DESC):
-            if run.run_count <= RESUMES:
-                state: State[Any] = Scheduled(message=f"Resumed, {run.run_count} of {RESUMES}: its process had died")
-                client.set_flow_run_state(run.id, state, force=True)
-                get_run_logger().warning("%s: %s", run.name, state.message)
-                names.append(run.name)
-    return names

@@ -74,6 +74,9 @@ def running_server(folder: Path) -> Iterator[PrefectApi]:
         "PREFECT_HOME": str(folder),
         "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
         "DO_NOT_TRACK": "1",
+        # As docs/deployment.md sets them: each death is told in two minutes.
+        "PREFECT_SERVER_EVENTS_CAUSAL_ORDERING": "roadscan.flows.ordering",
+        "PREFECT_SERVER_EVENTS_EXPIRED_BUCKET_BUFFER": "P30D",
     }
     log = folder / "server.log"
     api = PrefectApi(url, environment | {"PREFECT_API_URL": url})

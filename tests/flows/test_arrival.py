@@ -19,8 +19,7 @@ from prefect import flow
 from prefect.client.orchestration import SyncPrefectClient, get_client
 from prefect.client.schemas.actions import WorkPoolCreate
 from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterDeploymentId
-from prefect.client.schemas.objects import FlowRun, StateType
-from prefect.states import Crashed, Running
+from prefect.client.schemas.objects import FlowRun
 
 from roadscan.core.errors import ConfigError, RoadscanError, StoreError
 from roadscan.core.survey import Survey
@@ -174,20 +173,6 @@ def test_a_complete_folder_is_started_once(fleet: Fleet, client: SyncPrefectClie
     assert {name: run.work_queue_name for name, run in runs(client, fleet).items()} == {
         "drive-1": "default", "urgent-2": "urgent"
     }  # fmt: skip
-
-
-def test_a_run_whose_process_died_is_resumed_three_times(fleet: Fleet, client: SyncPrefectClient) -> None:
-    fleet.upload("drive-1")
-    fleet.watch()
-    run = runs(client, fleet)["drive-1"]
-    resumed: list[dict[str, list[str]]] = []
-    for _ in range(5):
-        client.set_flow_run_state(run.id, Running(), force=True)
-        assert fleet.watch() == {}
-        client.set_flow_run_state(run.id, Crashed(), force=True)
-        resumed.append(fleet.watch())
-    assert resumed == [{"resumed": ["drive-1"]}] * 3 + [{}] * 2
-    assert client.read_flow_run(run.id).state_type is StateType.CRASHED
 
 
 # --- from raw logs to a page --------------------------------------------------------------------------

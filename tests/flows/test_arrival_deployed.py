@@ -42,7 +42,7 @@ T = TypeVar("T")
 WAIT_S = 300.0
 """Longest wait for what a worker does: a look each minute, and a run."""
 ZOMBIE_S = 300.0
-"""Longest wait for the end of a dead run, which is due 150 s after its last heartbeat."""
+"""Longest wait for the end of a dead run, which is due 100 s after its last heartbeat."""
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def mailbox(deployed: PrefectApi) -> Iterator[Mailbox]:
         command += ["--notify", "custom-webhook/roadscan"]
         for _ in range(2):  # once more changes nothing
             said = subprocess.run(command, cwd=REPOSITORY, env=deployed.environment, check=True, capture_output=True)
-            assert said.stdout.count(b"installed: ") == 5
+            assert said.stdout.count(b"installed: ") == 9
         assert deployed.call("automation", "ls", cwd=REPOSITORY).count("roadscan zombies end") == 1
         yield box
 
@@ -301,7 +301,7 @@ def test_a_zombie_ends_and_is_resumed(service: Service, mailbox: Mailbox) -> Non
     before = service.files("zombie-1")
     assert service.reached("zombie-1", StateType.RUNNING).run_count == 1
     service.eventually(lambda: service.crashed("zombie-1"), "the dead run does not end", ZOMBIE_S)
-    assert service.crashed("zombie-1") == ["No heartbeat for 150 s, so its process is dead."]
+    assert service.crashed("zombie-1") == ["No heartbeat for 100 s, so its process is dead."]
     service.eventually(lambda: mailbox.about("zombie-1 crashed"), "no message of the crash")
     with service.worker("roadscan"):
         run = service.reached("zombie-1", StateType.COMPLETED)

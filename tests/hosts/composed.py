@@ -46,6 +46,8 @@ class Composed:
     given: dict[str, list[str]]
     """Commands of services whose image is not roadscan's: what stands for them here."""
     search_path: str
+    edited: dict[str, Path] = field(default_factory=dict)
+    """Files of deploy/ that a user has edited: what is mounted in their place."""
     hosts: dict[str, Host] = field(default_factory=dict)
     running: dict[str, Running] = field(default_factory=dict)
 
@@ -89,6 +91,8 @@ class Composed:
         return list(self.services[service].get("volumes", []))
 
     def _source(self, source: str) -> Path:
+        if source in self.edited:
+            return self.edited[source]
         if source.startswith("."):
             return (FILE.parent / source).resolve()
         if source.startswith("/"):
@@ -116,7 +120,9 @@ class Composed:
         elif condition == "service_healthy":
             test = self.services[needed]["healthcheck"]["test"]
             assert test[0] == "CMD"
-            eventually(lambda: self._is_healthy(needed, test[1:]), f"{needed} does not become healthy", HEALTHY_S)
+            self.running[needed].wait_until(
+                lambda: self._is_healthy(needed, test[1:]), f"{needed} does not become healthy", HEALTHY_S
+            )
 
     def _is_healthy(self, name: str, test: list[str]) -> bool:
         entered, entering = self.hosts[name].command(test, self._environment(self.services[_service(name)]))

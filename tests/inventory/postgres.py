@@ -16,7 +16,8 @@ import pytest
 WANTED = "PostgreSQL with PostGIS is not installed: `apt-get install postgresql postgresql-postgis`"
 
 
-def _programs() -> Path | None:
+def programs() -> Path | None:
+    """Folder of PostgreSQL's programs, None where it is not installed."""
     found = sorted(Path("/usr/lib/postgresql").glob("*/bin/initdb")) or [Path(p) for p in [shutil.which("initdb")] if p]
     return found[-1].resolve().parent if found else None
 
@@ -24,8 +25,8 @@ def _programs() -> Path | None:
 @contextmanager
 def server() -> Iterator[str]:
     """Address of a fresh database; its server ends with the block."""
-    programs = _programs()
-    if programs is None or not list(Path("/usr/share/postgresql").glob("*/extension/postgis.control")):
+    folder_of_programs = programs()
+    if folder_of_programs is None or not list(Path("/usr/share/postgresql").glob("*/extension/postgis.control")):
         pytest.skip(WANTED)
     user = "postgres" if os.geteuid() == 0 else None  # it refuses to run as root
     folder = Path(tempfile.mkdtemp(prefix="roadscan-pg-", dir="/tmp"))
@@ -38,7 +39,7 @@ def server() -> Iterator[str]:
 
         def call(*words: str) -> None:
             subprocess.run(
-                [str(programs / words[0]), *words[1:]], check=True, capture_output=True, user=user, cwd=folder
+                [str(folder_of_programs / words[0]), *words[1:]], check=True, capture_output=True, user=user, cwd=folder
             )
 
         data = str(folder / "data")

@@ -1,6 +1,7 @@
 """A whole run of a benchmark's survey in a process of its own, as `roadscan run` does it; prints figures as JSON.
 
-``python -m benchmarks.pipeline SURVEY.toml STORE WORKERS [PRODUCT …]``; started by :mod:`benchmarks.measured_run`.
+``python -m benchmarks.pipeline SURVEY.toml STORE WORKERS [default | PRODUCT …]``; started by
+:mod:`benchmarks.measured_run`. With `default` the survey file stays as it is, so that all is made that a user gets.
 """
 
 from __future__ import annotations
@@ -25,17 +26,21 @@ from roadscan.store.store import Store
 from roadscan.survey.run import close_run, run_stage
 from roadscan.tiles.product import products
 from roadscan.tiles.tasks.tile_plan import TILE
+from roadscan.tiles.tasks.wanted_products import wanted_products
 
 READING_TABLES = ("scans", "returns")
 WANTED = ("geotiff", "model_las")
 """5 mm height, intensity and count; LAZ at 100 mm."""
+DEFAULT = "default"
+"""Stands for the products that a survey file without a word about them makes."""
 
 
 def main() -> None:
     """Run all stages, one after another."""
-    survey = survey_with(Path(sys.argv[1]), sys.argv[4:] or list(WANTED))
+    file, asked = Path(sys.argv[1]), sys.argv[4:]
+    survey = Survey.load(file) if asked == [DEFAULT] else survey_with(file, asked or list(WANTED))
     store = Store(sys.argv[2], survey.config.id)
-    figures: dict[str, object] = {"products": survey.config.products.make}
+    figures: dict[str, object] = {"products": [product.name for product, _ in wanted_products(survey)]}
     timed: dict[str, dict[str, float]] = {}
     with compute_on(int(sys.argv[3])) as compute:
         started = time.perf_counter()

@@ -61,7 +61,9 @@ def _decoded(store: Store, file: str, footer: Footer, groups: Sequence[int], sch
 
         whole = not {"laser", "sweep"}.isdisjoint(schema.names)
         returns = vars(ReturnsReader(store, file, footer, whole=whole).read(groups))
-        return {name: pa.array(values) for name, values in returns.items() if name in schema.names and values is not None}
+        return {
+            name: pa.array(values) for name, values in returns.items() if name in schema.names and values is not None
+        }
     if {"range", "intensity"} <= set(schema.names):
         from roadscan.store.readings.profiles import ProfileReader
 

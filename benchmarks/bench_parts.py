@@ -1,4 +1,4 @@
-"""Where the nanoseconds of a default run go: parts of ingest and tiles, on each class of processor, beside memory.
+"""Where the nanoseconds of a default run go: stages and their parts, on each class of processor, beside memory.
 
 One process computes a drive's stages, once to compile and load the kernels and `repeats` times more; functions are
 wrapped, and each counts its own processor time without that of the others that it calls.
@@ -33,8 +33,8 @@ from roadscan.store.store import Store
 from roadscan.survey.run import run_stage
 from roadscan.tiles.product import TileProduct, products
 
-STAGES = ("ingest", "navigate", "footprints", "tiles", "products")
-"""Stages that are taken apart."""
+STAGES = ("ingest", "navigate", "footprints", "strips", "adjust", "tiles", "products")
+"""Stages that are looked at: what else a default run does takes next to nothing of these drives."""
 _PARTS = {
     "read and checked": ("roadscan.ingest.ingest:_items",),
     "written": ("roadscan.store.writer:LogWriter._write", "roadscan.store.writer:LogWriter.publish"),

@@ -6,12 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from benchmarks import surveys
-from benchmarks.bench_line_rate import END_TO_END
 from benchmarks.measured_run import Runs, measured_runs
+from benchmarks.pipeline import END_TO_END, FROM_LOGS
 from benchmarks.settings import Settings, bench_folder
 from benchmarks.timing import Figure
-
-ALL = ("ingest", *END_TO_END)
 
 
 def figures(folder: Path) -> Iterator[Figure]:
@@ -49,7 +47,7 @@ def _costs(runs: Runs, first: Runs) -> Iterator[Figure]:
             "end to end": one.cpu_s(*END_TO_END),
             "stored": one.figure("reading_bytes") / 1e6,
             "written": one.figure("tile_bytes") / 1e6,
-            "tasks": one.tasks(*ALL),
+            "tasks": one.tasks(*FROM_LOGS),
         }
         return values[what] / (one.survey.length_m / 1000)
 

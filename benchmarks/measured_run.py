@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
@@ -15,10 +17,32 @@ from typing import Any
 import psutil
 
 from benchmarks.surveys import BenchSurvey
+from roadscan.compute.kernels.processor import compiles_for
+from tests.kernels.test_plain_processor import AVX2
 
 _EVERY_S = 0.05
 _WORKER_MARK = "multiprocessing.spawn"
 """In the command line of Dask's workers."""
+
+
+@dataclass(frozen=True)
+class Way:
+    """How a survey is run."""
+
+    processor: str = ""
+    """Class of processor that kernels are compiled for; the machine's own where it is empty."""
+    products: tuple[str, ...] = ()
+    """What :mod:`benchmarks.pipeline` is asked for."""
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """What a process of this way is started with."""
+        return {**os.environ, **(AVX2 if self.processor == "AVX2" else {})}
+
+
+def processors() -> list[str]:
+    """Classes of processor that this machine can be tried as."""
+    return ["AVX-512", "AVX2"] if compiles_for("avx512f") else ["AVX2"]
 
 
 @dataclass(frozen=True)
@@ -27,6 +51,7 @@ class Runs:
 
     survey: BenchSurvey
     workers: int
+    way: Way = field(default_factory=Way)
     figures: list[dict[str, Any]] = field(default_factory=list)
     """One run each, as :mod:`benchmarks.pipeline` prints it, with `main_mb` and `worker_mb`."""
 
@@ -37,6 +62,19 @@ class Runs:
     def cpu_s(self, *stages: str) -> float:
         """Median over the runs of the processor time of these stages together, all processes."""
         return self._stages("cpu_s", stages)
+
+    @property
+    def stages(self) -> list[str]:
+        """The stages of a run, in their order."""
+        return list(self.figures[0]["stages"])
+
+    def real_time(self, *stages: str, by_processor: bool = False) -> float:
+        """How often the time that was recorded holds that of these stages.
+
+        `by_processor` : of their processor time on all workers' cores, which no other work on the machine lengthens.
+        """
+        seconds = self.cpu_s(*stages) / self.workers if by_processor else self.wall_s(*stages)
+        return self.survey.recorded_s / seconds
 
     def tasks(self, *stages: str) -> float:
         """Tasks handed to workers."""
@@ -52,20 +90,28 @@ class Runs:
 
 def measured_runs(survey: BenchSurvey, folder: Path, workers: int = 2, repeats: int = 5) -> Runs:
     """Run a survey `repeats` times; stores are made below `folder` and removed."""
-    runs = Runs(survey, workers)
+    return measured_in_turns(survey, folder, [Way()], workers, repeats)[0]
+
+
+def measured_in_turns(
+    survey: BenchSurvey, folder: Path, ways: Sequence[Way], workers: int = 2, repeats: int = 5
+) -> list[Runs]:
+    """Run a survey `repeats` times each way; the ways take turns, so that one clock of the machine holds for all."""
+    found = [Runs(survey, workers, way) for way in ways]
     for _ in range(repeats):
-        store = folder / "store"
-        shutil.rmtree(store, ignore_errors=True)
-        try:
-            runs.figures.append(_one_run(survey, store, workers))
-        finally:
+        for runs in found:
+            store = folder / "store"
             shutil.rmtree(store, ignore_errors=True)
-    return runs
+            try:
+                runs.figures.append(_one_run(survey, store, workers, runs.way))
+            finally:
+                shutil.rmtree(store, ignore_errors=True)
+    return found
 
 
-def _one_run(survey: BenchSurvey, store: Path, workers: int) -> dict[str, Any]:
-    command = [sys.executable, "-m", "benchmarks.pipeline", str(survey.file), str(store), str(workers)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+def _one_run(survey: BenchSurvey, store: Path, workers: int, way: Way) -> dict[str, Any]:
+    command = [sys.executable, "-m", "benchmarks.pipeline", str(survey.file), str(store), str(workers), *way.products]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=way.environment) as process:
         watch = _Watch(process.pid)
         watch.start()
         out, _ = process.communicate()

@@ -1,6 +1,8 @@
-"""A whole run of a benchmark's survey in a process of its own, as `roadscan run` does it; prints figures as JSON.
+"""A run of a benchmark's survey in a process of its own, as `roadscan run` does it; prints figures as JSON.
 
-``python -m benchmarks.pipeline SURVEY.toml STORE WORKERS [PRODUCT …]``; started by :mod:`benchmarks.measured_run`.
+``python -m benchmarks.pipeline SURVEY.toml STORE WORKERS [default | PRODUCT …]``; started by
+:mod:`benchmarks.measured_run`. With `default` the survey file stays as it is, and all its stages run: what a
+user gets. Else only what the products need is run, with the poses as they were recorded.
 """
 
 from __future__ import annotations
@@ -25,18 +27,27 @@ from roadscan.store.store import Store
 from roadscan.survey.run import close_run, run_stage
 from roadscan.tiles.product import products
 from roadscan.tiles.tasks.tile_plan import TILE
+from roadscan.tiles.tasks.wanted_products import wanted_products
 
 READING_TABLES = ("scans", "returns")
 WANTED = ("geotiff", "model_las")
 """5 mm height, intensity and count; LAZ at 100 mm."""
+END_TO_END = ("navigate", "footprints", "tiles", "products")
+"""Stages from stored readings to products."""
+FROM_LOGS = ("ingest", *END_TO_END)
+"""Stages that run where products are named."""
+DEFAULT = "default"
+"""Stands for the products that a survey file without a word about them makes."""
 
 
 def main() -> None:
     """Run all stages, one after another."""
-    survey = survey_with(Path(sys.argv[1]), sys.argv[4:] or list(WANTED))
+    file, asked = Path(sys.argv[1]), sys.argv[4:]
+    survey = Survey.load(file) if asked == [DEFAULT] else survey_with(file, asked or list(WANTED))
     store = Store(sys.argv[2], survey.config.id)
-    figures: dict[str, object] = {"products": survey.config.products.make}
+    figures: dict[str, object] = {"products": [product.name for product, _ in wanted_products(survey)]}
     timed: dict[str, dict[str, float]] = {}
+    chosen = [stage for stage in stages() if asked == [DEFAULT] or stage.name in FROM_LOGS]
     with compute_on(int(sys.argv[3])) as compute:
         started = time.perf_counter()
         for _ in compute.map(_imports, range(int(sys.argv[3]))):
@@ -44,9 +55,9 @@ def main() -> None:
         figures["start_s"] = time.perf_counter() - started
         run = Session(survey, store, _Counted(compute))
         with store.lock():
-            for stage in stages():
+            for stage in chosen:
                 timed[stage.name] = _timed(run, stage)
-            close_run(run, stages())
+            close_run(run, chosen)
     print(json.dumps(figures | {"stages": timed} | _stored(store)))
 
 

@@ -13,13 +13,13 @@ VARIABLE = "ROADSCAN_BENCH_SETTINGS"
 class Settings:
     """How large the surveys are and how often they run."""
 
-    pair_m: float = 400.0
+    pair_m: float = 100.0
     """Length of the pair's drive (m): 4 million readings and 12 MB of raw log a metre."""
-    hdl_s: float = 300.0
-    """Duration of the HDL-32E's drive (s): in a minute a quarter of the time would be the workers' start."""
-    sick_s: float = 3600.0
+    hdl_s: float = 60.0
+    """Duration of the HDL-32E's drive (s)."""
+    sick_s: float = 600.0
     """Duration of the SICK's drive (s)."""
-    repeats: int = 5
+    repeats: int = 3
     """Runs of each survey, of which the median counts; one more before them is not counted."""
     workers: int = 2
     sample_m: float = 5.0

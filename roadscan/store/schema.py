@@ -93,8 +93,8 @@ class TableSchema:
 
     def arrow(self, list_size: int | None = None) -> pa.Schema:
         """Return the Arrow schema, with unit, frame and meaning as field metadata."""
-        return pa.schema(
-            [
+        if list_size not in self._made:
+            fields = [
                 pa.field(
                     c.name,
                     c.arrow_type(list_size),
@@ -103,7 +103,13 @@ class TableSchema:
                 )
                 for c in self.columns
             ]
-        )
+            self._made[list_size] = pa.schema(fields)
+        return self._made[list_size]
+
+    @functools.cached_property
+    def _made(self) -> dict[int | None, pa.Schema]:
+        """Return the Arrow schemas made so far, by size of lists: each row group that is read asks for one."""
+        return {}
 
     def column(self, name: str) -> Column:
         """Return a column by name."""

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import duckdb
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -14,6 +15,7 @@ from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
 from roadscan.georeference.cloud import TilePoints
 from roadscan.ingest.inspect.inspect import inspect
+from roadscan.store.codecs.parquet.number_table import Lists, write_number_groups
 from roadscan.store.manifest import OutputRecord
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
@@ -59,6 +61,28 @@ def test_full_cells_come_back_to_the_bit(cells, tmp_path):
     for name, value in vars(cells).items():
         given = vars(back)[name]
         assert np.array_equal(given, value) and np.asarray(given).dtype == np.asarray(value).dtype, name
+    path = store.path(record.path)
+    rows = duckdb.sql(f"SELECT * FROM read_parquet('{path}', hive_partitioning = false)").fetchnumpy()
+    assert list(rows) == [c.name for c in table_schema("cells").columns]
+    assert np.array_equal(np.concatenate(rows["passes"]), cells.pass_ids)
+    assert np.array_equal([len(one) for one in rows["passes"]], cells.pass_count)
+    for name in ("height_mean_m", "height_std_m", "pass_count"):
+        assert np.array_equal(rows[name], getattr(cells, name)), name
+
+
+@pytest.mark.parametrize("sizes", [[1, 1, 1], [2, 2], [3, 1, 0, 2], [0, 0], [0, 5], list(range(40))])
+def test_lists_of_any_size_are_read_by_other_programs(sizes, tmp_path):
+    values = np.arange(sum(sizes), dtype=np.uint16) * 7
+    kind = pa.list_(pa.field("element", pa.uint16(), nullable=False))
+    schema = pa.schema([pa.field("n", pa.int32(), nullable=False), pa.field("ids", kind, nullable=False)])
+    groups = [{"n": np.array(sizes, np.int32), "ids": Lists(np.array(sizes), values)}]
+    write_number_groups(tmp_path / "a.parquet", schema, groups)
+    cuts = np.split(values, np.cumsum(sizes)[:-1])
+    for rows in (
+        pq.read_table(tmp_path / "a.parquet", page_checksum_verification=True),
+        duckdb.sql(f"SELECT * FROM '{tmp_path / 'a.parquet'}'").to_arrow_table(),
+    ):
+        assert rows["ids"].to_pylist() == [one.tolist() for one in cuts] and rows["n"].to_pylist() == sizes
 
 
 def test_surface_has_place_count_height_and_intensity(cells, tmp_path):

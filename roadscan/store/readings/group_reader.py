@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, Generic, TypeVar
+from typing import ClassVar, Generic, TypeAlias, TypeVar
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -14,11 +14,19 @@ from roadscan.core.errors import StoreError
 from roadscan.store.codecs.choice import LIBRARY
 from roadscan.store.codecs.parquet.page_file import DamageError, PageFile, read_footer
 from roadscan.store.damage import ROWS_CHANGE, UNREADABLE, unread
-from roadscan.store.readings.byte_source import opened
+from roadscan.store.readings.byte_source import LocalBytes, RemoteBytes, opened
 from roadscan.store.store import Store
 
+Footer: TypeAlias = tuple[LocalBytes | RemoteBytes, pq.FileMetaData, bool]
+"""An open file, its footer, and whether roadscan's own writer wrote it."""
 Rows = TypeVar("Rows")
 Pages = TypeVar("Pages", bound=PageFile)
+
+
+def opened_footer(store: Store, file: str) -> Footer:
+    """Open a file of the store and read its footer; raises what `store.damage.UNREADABLE` names."""
+    source = opened(store, store.path(file))
+    return source, *read_footer(source.stream)
 
 
 class GroupReader(ABC, Generic[Rows, Pages]):
@@ -35,12 +43,12 @@ class GroupReader(ABC, Generic[Rows, Pages]):
     columns: Sequence[str]
     """Columns that are read."""
 
-    def __init__(self, store: Store, file: str) -> None:
+    def __init__(self, store: Store, file: str, footer: Footer | None = None) -> None:
+        """`footer` : the file, where it is open."""
         self._file = file
         self._packed: Pages | None = None
         try:
-            self._source = opened(store, store.path(file))
-            self._metadata, ours = read_footer(self._source.stream)
+            self._source, self._metadata, ours = footer or opened_footer(store, file)
             suits = self._suits(self._metadata.schema.to_arrow_schema())
             if ours and suits and not LIBRARY:
                 self._packed = self._pages()

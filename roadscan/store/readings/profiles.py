@@ -15,7 +15,7 @@ import pyarrow as pa
 
 from roadscan.store.codecs.parquet.list_file import ListTableFile
 from roadscan.store.codecs.parquet.page_file import DamageError
-from roadscan.store.readings.group_reader import GroupReader
+from roadscan.store.readings.group_reader import Footer, GroupReader
 from roadscan.store.store import Store
 
 _COLUMNS: Final = ["epoch_gps_ns", "range", "intensity"]
@@ -43,12 +43,13 @@ class ProfileReader(GroupReader[Profiles, ListTableFile]):
     what = "profiles"
     columns = _COLUMNS
 
-    def __init__(self, store: Store, file: str) -> None:
+    def __init__(self, store: Store, file: str, footer: Footer | None = None) -> None:
+        """`footer` : the file, where it is open."""
         self._epochs: Int64 = np.empty(0, np.int64)
         self._ranges: UInt16 = np.empty(0, np.uint16)
         self._intensities: UInt8 = np.empty(0, np.uint8)
         self._size = 0
-        super().__init__(store, file)
+        super().__init__(store, file, footer)
 
     def _suits(self, schema: pa.Schema) -> bool:
         size = _list_size(schema)

@@ -15,12 +15,13 @@ import pyarrow as pa
 
 from roadscan.store.codecs.parquet.number_file import NumberFile
 from roadscan.store.codecs.parquet.page_file import DamageError
-from roadscan.store.readings.group_reader import GroupReader
+from roadscan.store.readings.group_reader import Footer, GroupReader
 from roadscan.store.readings.kernels.firings import Packed
 from roadscan.store.readings.packed_returns import EIGHT_TO_SIXTEEN_BITS, Beams, as_returns, is_packed
 from roadscan.store.store import Store
 
 _EPOCH, _POSE_EPOCH = "epoch_gps_ns", "pose_epoch_gps_ns"
+_LASER, _SWEEP = "laser", "sweep"
 _KINDS: Final[dict[str, np.dtype[Any]]] = {
     _EPOCH: np.dtype(np.int64), _POSE_EPOCH: np.dtype(np.int64),
     "x_sensor_m": np.dtype(np.float32), "y_sensor_m": np.dtype(np.float32), "z_sensor_m": np.dtype(np.float32),
@@ -50,6 +51,9 @@ class Returns:
     y_sensor_m: Float32
     z_sensor_m: Float32
     intensity: npt.NDArray[np.uint16]
+    laser: npt.NDArray[np.uint8] | None = None
+    """As `sweep`, only of packed returns, and where asked for."""
+    sweep: npt.NDArray[np.int32] | None = None
 
 
 class ReturnsReader(GroupReader[Returns, NumberFile]):
@@ -58,16 +62,19 @@ class ReturnsReader(GroupReader[Returns, NumberFile]):
     what = "returns"
     columns = _COLUMNS
 
-    def __init__(self, store: Store, file: str) -> None:
+    def __init__(self, store: Store, file: str, footer: Footer | None = None, *, whole: bool = False) -> None:
+        """`footer` : the file, where it is open; whole : lasers and sweeps of packed returns are read, too."""
+        self._whole = whole
         self._arrays = {name: np.empty(0, kind) for name, kind in _KINDS.items()}
         self._distance = np.empty(0, np.uint16)
         self._beams: Beams | None = None
         """Beams of the sensor; None in a file of ``returns``."""
-        super().__init__(store, file)
+        super().__init__(store, file, footer)
 
     def _suits(self, schema: pa.Schema) -> bool:
         if is_packed(schema.names):
-            self._beams, self.columns = Beams.of(self._metadata.metadata), list(_PACKED_KINDS)
+            self._beams = Beams.of(self._metadata.metadata)
+            self.columns = [*_PACKED_KINDS, *([_SWEEP] if self._whole else [])]
         missing = set(self.columns).difference(schema.names)
         if missing:
             raise DamageError(f"it has no column '{min(missing)}'")
@@ -109,6 +116,8 @@ class ReturnsReader(GroupReader[Returns, NumberFile]):
             self._distance = np.empty(total, np.uint16)
         columns = {name: values[:total] for name, values in self._arrays.items()}
         columns[_POSE_EPOCH] = columns[_EPOCH]
+        if self._whole:
+            columns |= {_LASER: np.empty(total, np.uint8), _SWEEP: np.empty(total, np.int32)}
         for group, n in zip(groups, rows, strict=True):
             packed.load(group, self.columns)
             own = slice(first, first + n)
@@ -117,10 +126,15 @@ class ReturnsReader(GroupReader[Returns, NumberFile]):
             packed.numbers("distance", self._distance[:n])
             head_end, head = packed.runs("head", n, _PACKED_KINDS["head"])
             rate_end, rate = packed.runs("rate_rad_per_ns", n, _PACKED_KINDS["rate_rad_per_ns"])
-            polar = Packed(head, head_end, rate, rate_end, self._distance[:n], packed.bytes("slot", n))
+            slot = packed.bytes("slot", n)
+            polar = Packed(head, head_end, rate, rate_end, self._distance[:n], slot)
             beams.places(polar, [columns[f"{axis}_sensor_m"][own] for axis in "xyz"])
+            if self._whole:
+                columns[_LASER][own] = beams.lasers[slot]
+                end, sweep = packed.runs(_SWEEP, n, columns[_SWEEP].dtype)
+                columns[_SWEEP][own] = np.repeat(sweep, np.diff(end, prepend=0))
             first += n
-        return Returns(*(columns[name] for name in _COLUMNS))
+        return Returns(*columns.values())
 
     def _from_table(self, rows: pa.Table) -> Returns:
         rows = as_returns(rows, _COLUMNS)

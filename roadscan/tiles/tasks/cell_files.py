@@ -1,10 +1,7 @@
-"""Files of a tile's cells and of their overviews: Parquet, in the encodings that were fastest and smallest.
+"""Files of a tile's cells and of their overviews: Parquet, byte planes under LZ4 by roadscan's own writer.
 
-Surfaces and overviews go through `roadscan/store/plane_table.py`: byte planes under LZ4 take 17 ns of one core and
-5.8 bytes a cell of the line-rate pair (Parquet's general writer and ZSTD: 42 ns, 5.2 bytes). Of full tables, measured
-on 1.6 million cells of 5 mm (plain bytes: 4.5 ns): rows and columns as plain numbers under ZSTD 4 and 6 ns (delta
-packing 8 and 8, dictionary 8 and 14); counts split into byte planes under ZSTD 8 ns, 0.6 B (delta packing 11, 0.7;
-plain 24, 0.9); heights in byte planes 16 ns, 5.0 B (plain 34, 2.1 when rounded).
+Of 0.95 million cells of 5 mm, each of 25 readings of one pass, all columns take 20 ns of a core and 27.5 bytes a cell
+(Parquet's general writer: 60 ns and 26.8 bytes under ZSTD 1, 44 ns and 27.8 bytes under LZ4), a surface 8 ns and 5.8.
 """
 
 from __future__ import annotations
@@ -24,7 +21,7 @@ import pyarrow.parquet as pq
 from roadscan.core.errors import DamagedError, StoreError
 from roadscan.core.ids import TileId
 from roadscan.core.survey import CellColumns
-from roadscan.store.codecs.parquet.number_table import write_number_groups
+from roadscan.store.codecs.parquet.number_table import Lists, write_number_groups
 from roadscan.store.damage import UNREADABLE
 from roadscan.store.manifest import OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
@@ -45,45 +42,26 @@ _ROUNDED: Final = {
     "intensity": INTENSITY_STEP,
 }
 _PLACES: Final = ("factor", "row", "column")
-_LISTS: Final = "passes.list.element"
 _GROUP_ROWS: Final = 1 << 20  # Rows in a row group.
-
-
-def cells_table(cells: TileCells, columns: CellColumns = "full") -> pa.Table:
-    """Return cells as rows of ``schemas/cells.toml``; a ``surface`` has only the mandatory columns, rounded."""
-    schema = _stored("cells", columns)
-    if columns == "surface":
-        return pa.table([_rounded(n, getattr(cells, n)) for n in schema.names], schema=schema)
-    passes = pa.ListArray.from_arrays(cells.pass_offsets, cells.pass_ids, type=schema.field("passes").type)
-    return pa.table([passes if n == "passes" else getattr(cells, n) for n in schema.names], schema=schema)
-
-
-def overviews_table(levels: Sequence[Level]) -> pa.Table:
-    """Return overviews as rows of ``schemas/overviews.toml``, heights and intensities rounded."""
-    schema = _stored("overviews", "full")
-    parts = [
-        pa.table(
-            [np.full(len(one), one.factor, np.uint16), *(_rounded(n, getattr(one, n)) for n in schema.names[1:])],
-            schema=schema,
-        )
-        for one in levels
-    ]
-    return pa.concat_tables([schema.empty_table(), *parts])
 
 
 def write_cells(path: Path, cells: TileCells, columns: CellColumns = "full") -> None:
     """Write a tile's cells; same cells, same bytes."""
-    if columns == "surface":
-        schema, n = _stored("cells", columns), len(cells)
-        held = {name: getattr(cells, name) for name in schema.names}
-        groups = [
-            {name: values[k : k + _GROUP_ROWS] for name, values in held.items()} for k in range(0, n, _GROUP_ROWS)
-        ]
-        write_number_groups(path, schema, groups, _ROUNDED, _PLACES)
-        return
-    rows = cells_table(cells, columns)
-    with pq.ParquetWriter(path, rows.schema, **_settings(rows.schema)) as writer:
-        writer.write_table(rows, row_group_size=_GROUP_ROWS)
+    schema, n = _stored("cells", columns), len(cells)
+    groups = (_rows_of(cells, schema, k, min(k + _GROUP_ROWS, n)) for k in range(0, n, _GROUP_ROWS))
+    write_number_groups(path, schema, groups, _ROUNDED if columns == "surface" else None, _PLACES)
+
+
+def _rows_of(cells: TileCells, schema: pa.Schema, first: int, end: int) -> dict[str, npt.NDArray[Any] | Lists]:
+    """Return the columns of the cells `first` to `end` − 1."""
+    found: dict[str, npt.NDArray[Any] | Lists] = {}
+    for field in schema:
+        if pa.types.is_list(field.type):
+            offsets = cells.pass_offsets[first : end + 1]
+            found[field.name] = Lists(np.diff(offsets).astype(np.int64), cells.pass_ids[offsets[0] : offsets[-1]])
+        else:
+            found[field.name] = getattr(cells, field.name)[first:end].astype(field.type.to_pandas_dtype(), copy=False)
+    return found
 
 
 def write_overviews(path: Path, levels: Sequence[Level]) -> None:
@@ -149,25 +127,3 @@ def _stored(table: str, columns: CellColumns) -> pa.Schema:
     if columns == "full":  # all columns are present without nulls: levels of nulls would take time
         return pa.schema([f.with_nullable(False) for f in schema])
     return pa.schema([f for f in schema if not f.nullable])
-
-
-def _rounded(name: str, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    step = _ROUNDED.get(name)
-    if step is None:
-        return values
-    rounded: npt.NDArray[Any] = values * values.dtype.type(1 / step)
-    np.rint(rounded, out=rounded)
-    rounded *= values.dtype.type(step)
-    return rounded
-
-
-def _settings(schema: pa.Schema) -> dict[str, Any]:
-    """Return encodings by column: plain for places, which repeat; byte planes for all else; dictionaries for lists."""
-    planes = {f.name: "BYTE_STREAM_SPLIT" for f in schema if f.name not in (*_PLACES, "pass_count", "passes")}
-    return {
-        "compression": "zstd",
-        "compression_level": 1,
-        "use_dictionary": [n for n in ("pass_count", _LISTS) if n.split(".")[0] in schema.names],
-        "column_encoding": planes,
-        "write_statistics": [n for n in _PLACES if n in schema.names],
-    }

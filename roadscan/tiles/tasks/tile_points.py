@@ -184,7 +184,7 @@ class _Joined:
             return None
         sources, epochs = self.sources[rows], self.epoch_gps_ns[rows]
         sigma = np.full(2, -1.0)
-        for number in np.unique(sources).tolist():
+        for number in np.flatnonzero(np.bincount(sources)).tolist():
             trajectory = self.trajectories[number]
             if trajectory is None:
                 sigma[:] = np.inf

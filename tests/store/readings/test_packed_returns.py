@@ -76,6 +76,7 @@ def test_roadscan_arrow_and_duckdb_make_the_same_rows(recording: Path) -> None:
     groups = range(pq.read_metadata(store.path(path)).num_row_groups)
     rows = read_groups(store, path, groups)
     assert rows.schema.equals(table_schema("returns").arrow()) and rows.num_rows == 146_705
+    assert as_returns(pq.read_table(store.path(path), partitioning=None)).equals(rows)  # read by Arrow
     reader = ReturnsReader(store, path)
     assert same(reader.read(groups), rows)
     part = read_groups(store, path, [1], ["laser", "z_sensor_m"])

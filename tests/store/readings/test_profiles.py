@@ -15,6 +15,7 @@ import pytest
 from roadscan.core.errors import StoreError
 from roadscan.store.codecs.parquet.list_table import is_list_table
 from roadscan.store.readings.profiles import ProfileReader, Profiles
+from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.store.writer import LogWriter, write_parquet
@@ -128,6 +129,17 @@ def test_reader_gives_back_what_was_written(name: str, store: Store) -> None:
     for group in reversed(groups):
         assert same(reader.read([group]), rows.slice(group * GROUP, GROUP))
     assert reader.read([]).range.shape[0] == 0
+
+
+@pytest.mark.parametrize("name", [name for name in TABLES if name != "none"])
+def test_rows_for_other_stages_are_those_that_were_written(name: str, store: Store) -> None:
+    rows = TABLES[name]
+    put(store, rows)
+    groups = range(-(-rows.num_rows // GROUP))
+    assert read_groups(store, FILE, groups).equals(rows)
+    some_of_it = ["intensity", "epoch_gps_ns", "range"]
+    part = read_groups(store, FILE, groups[-1:], some_of_it)
+    assert part.select(some_of_it).equals(rows.slice(groups[-1] * GROUP, GROUP).select(some_of_it))
 
 
 @pytest.mark.own_codecs

@@ -64,6 +64,7 @@ def same(found: Returns, rows: pa.Table) -> bool:
         values.tobytes() == rows.column(name).to_numpy().tobytes()
         and values.dtype == rows.column(name).to_numpy().dtype
         for name, values in vars(found).items()
+        if values is not None
     )
 
 

@@ -174,13 +174,17 @@ class Writer:
     def _lists(self, field: pa.Field, column: pa.Array) -> Value:
         values = column.flatten().to_numpy()
         levels = pages.list_levels(len(column), field.type.list_size, _valid(field, column))
-        if self._words.size < room_words(values.size):
-            self._words = np.empty(room_words(values.size), np.uint64)
-        packed = self._words.view(np.uint8)[: _ENCODE(values, self._words)]
+        packed = self.steps(values)
         count = values.size + column.null_count
         at, size = self.page(levels, packed, count, pages.DELTA_BINARY_PACKED)
         path = (field.name, "list", "element")
         return chunk(KINDS[field.type.value_type], path, pages.DELTA_BINARY_PACKED, count, Page(at, size), {})
+
+    def steps(self, values: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
+        """Return the content of a page of differences of bytes or 16-bit numbers (n,), valid until the next one."""
+        if self._words.size < room_words(values.size):
+            self._words = np.empty(room_words(values.size), np.uint64)
+        return self._words.view(np.uint8)[: _ENCODE(values, self._words)]
 
     def pack(self, content: npt.NDArray[np.uint8]) -> Packed:
         """Return the content of a page under LZ4."""
@@ -273,7 +277,7 @@ def _elements(schema: pa.Schema) -> Iterator[Value]:
     yield struct({3: i32(_REQUIRED), 4: binary("schema"), 5: i32(len(schema))})
     for field in schema:
         own = {3: i32(_OPTIONAL if field.nullable else _REQUIRED), 4: binary(field.name)}
-        if not pa.types.is_fixed_size_list(field.type):
+        if not pa.types.is_nested(field.type):
             kind = KINDS[field.type]
             yield struct({1: i32(kind.physical)} | own | kind.fields())
             continue

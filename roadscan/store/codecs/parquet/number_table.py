@@ -1,4 +1,4 @@
-"""Writes Parquet files of flat tables of non-null numbers in measured order: returns of a lidar, cells.
+"""Writes Parquet files of tables of non-null numbers in measured order: returns of a lidar, cells.
 
 64-bit numbers, which are epochs, are differences, all others byte planes; both under LZ4. Planes of measured numbers
 are constant or noise: ZSTD's level 1 takes nearly twice the time of LZ4 for them and saves a fifth of the room. Each
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,14 +19,27 @@ import pyarrow.parquet as pq
 from roadscan.store.codecs.choice import LIBRARY
 from roadscan.store.codecs.kernels.run_lengths import LONGEST_RUN_BYTES, encode_runs
 from roadscan.store.codecs.parquet import pages
-from roadscan.store.codecs.parquet.list_table import KINDS, Packed, Writer
+from roadscan.store.codecs.parquet.list_table import KINDS, Packed, Page, Writer, chunk
 from roadscan.store.codecs.parquet.thrift import Value, binary, i64, struct, varint, zigzag
 
 _SCRATCH: Final = 2048  # values of the scratch line that the kernels need
 
 Array = npt.NDArray[Any]
 Bytes = npt.NDArray[np.uint8]
-Columns = Mapping[str, Array]
+
+
+class Lists(NamedTuple):
+    """Lists of bytes or 16-bit numbers, one after another."""
+
+    sizes: npt.NDArray[np.int64]
+    """(n,) numbers of each."""
+    values: Array
+
+    def __len__(self) -> int:
+        return self.sizes.size
+
+
+Columns = Mapping[str, Array | Lists]
 
 
 def is_number_table(schema: pa.Schema) -> bool:
@@ -60,7 +73,7 @@ def write_number_groups(
     Parameters
     ----------
     schema : one of `is_number_table`.
-    groups : arrays of each column by its name, of the schema's types.
+    groups : arrays of each column by its name, of the schema's types; `Lists` of a column of lists.
     steps : columns of floats that are rounded to a multiple of a power of two.
     stated : columns whose least and largest value stand in the footer; all where it is left out.
     runs : columns that are written as a dictionary and indices: bytes, and numbers that stay the same for many rows.
@@ -76,9 +89,11 @@ def write_number_groups(
         for number, columns in enumerate(groups):
             size = len(columns[schema.names[0]])
             chunks = [
-                writer.runs(field, columns[field.name], field.name in stated)
+                writer.lists(field, values)
+                if isinstance(values := columns[field.name], Lists)
+                else writer.runs(field, values, field.name in stated)
                 if field.name in runs
-                else writer.column(field, columns[field.name], steps.get(field.name), field.name in stated)
+                else writer.column(field, values, steps.get(field.name), field.name in stated)
                 for field in schema
             ]
             written.append(writer.row_group(chunks, size, number))
@@ -114,6 +129,15 @@ class _Numbers(Writer):
         dictionary = self.pack(known.astype(KINDS[field.type].stored).view(np.uint8))
         more = _stated(field, values if values.dtype == np.uint8 else known, stated)
         return self.with_dictionary(field, dictionary, known.size, self.pack(page), values.size, more)
+
+    def lists(self, field: pa.Field, lists: Lists) -> Value:
+        """Write a column chunk of non-null lists; return its part of the footer."""
+        levels, count = pages.varied_list_levels(lists.sizes)
+        packed = self.pack(np.concatenate([np.frombuffer(levels, np.uint8), self.steps(lists.values)]))
+        at, size = self.page(b"", packed.content, count, pages.DELTA_BINARY_PACKED, packed.raw)
+        place = Page(at, size, size - packed.content.size + packed.raw)
+        kind, path = KINDS[field.type.value_type], (field.name, "list", "element")
+        return chunk(kind, path, pages.DELTA_BINARY_PACKED, count, place, {})
 
     def _differences(self, values: Array) -> tuple[int, Bytes]:
         from roadscan.store.codecs.kernels.delta_packing import BLOCK, MINIBLOCKS
@@ -179,13 +203,20 @@ def _statistics(values: Array, stored: str) -> dict[int, Value]:
 def _write_by_arrow(
     path: Path, schema: pa.Schema, groups: Iterable[Columns], steps: Mapping[str, float], runs: Collection[str]
 ) -> None:
-    split = [f for f in schema if f.name not in runs]
+    split = [f for f in schema if f.name not in runs and not pa.types.is_nested(f.type)]
     encodings = {f.name: "DELTA_BINARY_PACKED" if f.type == pa.int64() else "BYTE_STREAM_SPLIT" for f in split}
     settings = {"compression": "lz4", "use_dictionary": list(runs), "write_page_checksum": True}
     with pq.ParquetWriter(path, schema, column_encoding=encodings, **settings) as writer:
         for columns in groups:
-            rounded = [_rounded(columns[name], steps.get(name)) for name in schema.names]
+            rounded = [_arrow(field, columns[field.name], steps.get(field.name)) for field in schema]
             writer.write_table(pa.table(rounded, schema=schema), row_group_size=max(1, len(rounded[0])))
+
+
+def _arrow(field: pa.Field, values: Array | Lists, step: float | None) -> Array | pa.Array:
+    if isinstance(values, Lists):
+        offsets = np.concatenate([[0], np.cumsum(values.sizes)]).astype(np.int32)
+        return pa.ListArray.from_arrays(offsets, values.values, type=field.type)
+    return _rounded(values, step)
 
 
 def _rounded(values: Array, step: float | None) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -21,6 +22,8 @@ TAIL_BYTES: Final = 8
 _FOOTER_BYTES: Final = 64 << 10
 """Bytes from the end of a file that are read at first: most footers are shorter, and each read is a request to an
 object store."""
+_KEPT_FOOTERS: Final = 8
+"""Footers that are kept as they were parsed, a few MB each: the files of a place's passes are read in turns."""
 _WORD: Final = 8  # bytes of a 64-bit word
 _LISTED: Final = ".list.element"
 
@@ -55,7 +58,7 @@ class _Chunk:
 
 def read_footer(stream: Any) -> tuple[pq.FileMetaData, bool]:
     """Return the footer of a Parquet file, and whether `list_table` wrote it; DamageError where it is damaged."""
-    from roadscan.store.codecs.parquet.list_table import MAGIC, sealed
+    from roadscan.store.codecs.parquet.list_table import MAGIC
 
     size = stream.seek(0, os.SEEK_END)
     tail = _read(stream, max(size - _FOOTER_BYTES, 0), size)
@@ -63,7 +66,14 @@ def read_footer(stream: Any) -> tuple[pq.FileMetaData, bool]:
     if tail[-4:] != MAGIC or length > size - TAIL_BYTES:
         raise DamageError("it does not end as a Parquet file")
     footer = TAIL_BYTES + length
-    tail = tail[-footer:] if footer <= len(tail) else _read(stream, size - footer, size)
+    return _parsed(tail[-footer:] if footer <= len(tail) else _read(stream, size - footer, size))
+
+
+@functools.lru_cache(maxsize=_KEPT_FOOTERS)
+def _parsed(tail: bytes) -> tuple[pq.FileMetaData, bool]:
+    """Return what the end of a file from its footer on says; rows of a file are read some row groups at a time."""
+    from roadscan.store.codecs.parquet.list_table import sealed
+
     ours = sealed(tail[:-TAIL_BYTES])
     if ours is False:
         raise DamageError("its footer does not have its checksum")

@@ -59,6 +59,17 @@ def list_levels(rows: int, size: int, valid: npt.NDArray[np.bool_] | None) -> by
     return _section(repetition) + _section(b"".join(_run(n * size, 2) if there else _run(n, 0) for there, n in runs))
 
 
+def varied_list_levels(sizes: npt.NDArray[np.int64]) -> tuple[bytes, int]:
+    """Return the encoded levels of non-null lists of so many (n,) non-null values each, and the number of levels."""
+    slots = np.maximum(sizes, 1)
+    starts = np.cumsum(slots) - slots
+    total = int(slots.sum())
+    continues, filled = np.ones(total, np.bool_), np.ones(total, np.bool_)
+    continues[starts] = False
+    filled[starts[sizes == 0]] = False
+    return _section(_bits(continues)) + _section(_bits(filled)), total
+
+
 def bit_packed(values: int) -> bytes:
     """Return what precedes one group of bit-packed dictionary indices, which come in eights."""
     return thrift.varint(-(-values // 8) << 1 | 1)
@@ -144,6 +155,13 @@ def _number(varint: bytes) -> int:
 
 def _section(runs: bytes) -> bytes:
     return len(runs).to_bytes(_LENGTH_BYTES, "little") + runs
+
+
+def _bits(levels: Bools) -> bytes:
+    """Return levels (n,) of one bit: a run where all are equal."""
+    if not levels.size or (levels == levels[0]).all():
+        return _run(levels.size, int(levels[0])) if levels.size else b""
+    return bit_packed(levels.size) + np.packbits(levels, bitorder="little").tobytes()
 
 
 def _run(count: int, level: int) -> bytes:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import pyarrow.parquet as pq
 
 from roadscan.core.errors import DamagedError, RoadscanError, StoreError
 from roadscan.core.witness import Finding
-from roadscan.footprints.footprints import PRODUCT
+from roadscan.footprints.footprints import JOINED, PRODUCT
 from roadscan.georeference.plan.plan import NothingToPlaceError
 from roadscan.georeference.reading_counts import reading_counts
 from roadscan.ingest.overlap import NothingPlacedError
@@ -34,6 +34,9 @@ from roadscan.survey.forgotten import forgotten_pictures
 from roadscan.survey.preflight import preflight
 from roadscan.tiles.product import products
 from roadscan.tiles.tasks.tile_plan import TILE
+
+_UNSHOWN: Final = (PRODUCT, JOINED)
+"""Products that are no file that somebody asked for."""
 
 
 @dataclass
@@ -138,7 +141,7 @@ def _survey_status(session: Session) -> Status:
     status.logs += [_unplanned_state(one) for one in unplanned]
     keys = {*(log.key for log in planned), *known_keys(session.survey, store, logs_of(session))}
     status.unused_logs = [f"{r.run}/{r.sensor} {r.path}" for r in records.values() if r.key not in keys]
-    status.outputs = {product: count for product, count in manifest.files().items() if product != PRODUCT}
+    status.outputs = {product: count for product, count in manifest.files().items() if product not in _UNSHOWN}
     files = (one for r in records.values() if r.key in keys for one in r.tables.items())
     for table, own in files:
         status.ingested[table] = status.ingested.get(table, 0) + len(own)

@@ -8,12 +8,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
+from weakref import WeakValueDictionary
 
 import numpy as np
 
 from roadscan.core.errors import DamagedError, StoreError
 from roadscan.core.witness import Finding
 from roadscan.store.checked_json import checked_json, parse_checked
+from roadscan.store.digest import bytes_digest
 from roadscan.store.readings.group_spans import GroupSpans
 from roadscan.store.store import Store
 
@@ -22,6 +24,9 @@ _COPIES: Final = "manifest/log_copies"
 
 NAVIGATION: Final = "navigation"
 """Sensor in the records of computed trajectories."""
+
+_HELD: Final[WeakValueDictionary[tuple[str, str], LogRecord]] = WeakValueDictionary()
+"""Records that somebody holds, by file and digest of its content: a run and `status` ask for them again and again."""
 
 
 @dataclass(frozen=True)
@@ -189,6 +194,9 @@ def data_file(raw: Mapping[str, Any]) -> DataFile:
 
 def parse_log_record(content: bytes, key: str, path: str) -> LogRecord:
     """Return the record of the log `key`, from the content of the file `path`."""
+    known = (path, bytes_digest(content))
+    if (held := _HELD.get(known)) is not None:
+        return held
     try:
         raw = parse_checked(content)
         raw["tables"] = {name: tuple(map(data_file, files)) for name, files in raw["tables"].items()}
@@ -202,4 +210,5 @@ def parse_log_record(content: bytes, key: str, path: str) -> LogRecord:
             change="the next run puts its copy in its place, or reads the log again",
             file=path,
         ) from error
+    _HELD[known] = record
     return record

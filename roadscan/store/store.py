@@ -55,6 +55,9 @@ _MAKE_ROOM: Final = (
     "see to more room, and run again: what is finished stays, and the next run goes on where this one stopped"
 )
 
+_MANY_FILES: Final = 64
+"""Files whose folders are listed, where fewer are asked for one by one: a folder may hold many others."""
+
 MADE_AGAIN: Final = "run `roadscan verify`, which finds all such files; the next run then makes them again"
 """How a damaged product is repaired."""
 
@@ -122,6 +125,19 @@ class Store:
             return int(self.fs.size(self.path(relative)))
         except FileNotFoundError:
             return None
+
+    def sizes(self, paths: Sequence[str]) -> list[int | None]:
+        """Return the bytes of some files, None for each that is missing; folders with many of them are listed once."""
+        if not self.is_folder or len(paths) < _MANY_FILES:
+            return list(map(self.size, paths))
+        places = [path.rpartition("/") for path in paths]
+        held = {folder: self._sizes_in(folder) for folder in {folder for folder, _, _ in places}}
+        return [held[folder].get(name) for folder, _, name in places]
+
+    def _sizes_in(self, folder: str) -> dict[str, int]:
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(self.path(folder)) as entries:
+            return {one.name: one.stat().st_size for one in entries if one.is_file()}
+        return {}
 
     def files(self, relative: str, suffix: str = "") -> list[str]:
         """Return the files below a folder, relative to the root, sorted."""

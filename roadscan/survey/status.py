@@ -13,7 +13,7 @@ from roadscan.core.errors import DamagedError, RoadscanError, StoreError
 from roadscan.core.witness import Finding
 from roadscan.footprints.footprints import JOINED, PRODUCT
 from roadscan.georeference.plan.plan import NothingToPlaceError
-from roadscan.georeference.reading_counts import reading_counts
+from roadscan.georeference.reading_counts import LogCounts
 from roadscan.ingest.overlap import NothingPlacedError
 from roadscan.ingest.planned_logs import PlannedLog, UnplannedLog, logs_of
 from roadscan.ingest.sources import damaged_sources
@@ -33,7 +33,7 @@ from roadscan.store.written_by import VERSION_FILE
 from roadscan.survey.forgotten import forgotten_pictures
 from roadscan.survey.preflight import preflight
 from roadscan.tiles.product import products
-from roadscan.tiles.tasks.tile_plan import TILE
+from roadscan.tiles.tasks.tile_figures import tile_figures
 
 _UNSHOWN: Final = (PRODUCT, JOINED)
 """Products that are no file that somebody asked for."""
@@ -127,6 +127,7 @@ def survey_status(session: Session) -> Status:
 
 def _survey_status(session: Session) -> Status:
     store, damaged = session.store, session.hear_of_damage()
+    records = {r.key: r for r in read_log_records(store, damaged=damaged)}  # held from here on, not read again
     found = preflight(session.survey, store)
     causes = [*map(str, found.causes), *found.failing]
     status = Status(failures=read_failures(store), would_fail=causes.copy(), checked=list(found.notes))
@@ -134,7 +135,6 @@ def _survey_status(session: Session) -> Status:
     unsaid = [u for u in unplanned if not causes]  # otherwise reported there, once per cause
     status.failures += [{"stage": "ingest", "unit": u.path, "reason": str(u.error)} for u in unsaid]
     manifest = session.manifest
-    records = {r.key: r for r in read_log_records(store, damaged=damaged)}
     status.damaged = list(map(str, damaged))
     status.lost = read_lost(store)
     status.logs = [_log_state(store, log, records.get(log.key)) for log in planned]
@@ -145,7 +145,7 @@ def _survey_status(session: Session) -> Status:
     files = (one for r in records.values() if r.key in keys for one in r.tables.items())
     for table, own in files:
         status.ingested[table] = status.ingested.get(table, 0) + len(own)
-    status.readings = reading_counts([*manifest.of(PRODUCT).values(), *manifest.of(TILE).values()])
+    status.readings = (LogCounts(manifest.of(PRODUCT).values()) + tile_figures(manifest).counts).of_all()
     status.findings = findings_of(session.survey, [r for r in records.values() if r.key in keys], manifest)
     for stage in stages():
         try:

@@ -9,7 +9,6 @@ are as many and as long as those of a survey, and every command of roadscan work
 from __future__ import annotations
 
 import dataclasses
-import functools
 import json
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -18,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import rasterio
 
 from benchmarks.course import CRS, GEODETIC, START_S, WEEK, Course
 from benchmarks.network import HEADS, TILE_M, Drive
@@ -60,14 +58,18 @@ _CELL_M = 0.005
 _SMALL_GRID = TileGrid(2.0, 0.1)
 """Of the tiny files: a raster of a whole tile in cells of 5 mm takes 58 kB when it is empty."""
 _POINT_M = 87.1
+_RASTER = "geotiff"
+"""Product whose file of a tile stands for a sheet of a kilometre."""
 _WINDOW = '{"window": [56321, 593487, 56350, 593512]}'
 """Detail of a data file's footprints."""
 
 
-def simulated_survey(folder: Path, name: str, length_m: float, store: str = "store") -> Path:
+def simulated_survey(
+    folder: Path, name: str, length_m: float, store: str = "store", poses_per_s: int = _POSES_PER_S
+) -> Path:
     """The survey file of a drive of that length, in `folder`, whose logs are ingested in the store."""
     folder.mkdir(parents=True, exist_ok=True)
-    file = _write_logs(folder, name, length_m, store)
+    file = _write_logs(folder, name, length_m, store, poses_per_s)
     survey = Survey.load(file)
     target = Store(survey.store_url, name)
     run_stages(Session(survey, target), [stage_named("ingest")])
@@ -139,7 +141,7 @@ class TinyFiles(Inline):
         if isinstance(task, FootprintTask):
             content, name, unit, detail = self._footprints(task), PRODUCT, task.slice.file, _WINDOW
         elif task.output.name.endswith(".tif"):
-            content, name, unit, detail = _one_pixel(), task.product.name, task.output.name, ""
+            content, name, unit, detail = self._made[_RASTER][0], task.product.name, task.output.name, ""
         else:
             return function(task)
         task.store.write_bytes(task.target, content, lasting=False)
@@ -194,16 +196,7 @@ _FIGURES = {
 }  # fmt: skip
 
 
-@functools.cache
-def _one_pixel() -> bytes:
-    """A sheet of one pixel."""
-    with rasterio.MemoryFile() as file:
-        with file.open(driver="GTiff", width=1, height=1, count=1, dtype="float32") as image:
-            image.write(np.zeros((1, 1, 1), np.float32))
-        return bytes(file.read())
-
-
-def _write_logs(folder: Path, name: str, length_m: float, store: str) -> Path:
+def _write_logs(folder: Path, name: str, length_m: float, store: str, poses_per_s: int) -> Path:
     """Write poses and some profiles of each run, and the survey file."""
     geometry = {
         "kind": "cartesian", "readings": _READINGS, "first": -1.0, "step": 0.25, "range_offset_m": 0.2,
@@ -218,7 +211,7 @@ def _write_logs(folder: Path, name: str, length_m: float, store: str) -> Path:
         lines += ["[[runs]]", f'id = "{drive.run}"', "[[runs.logs]]", f'path = "{drive.run}.sbet"', 'format = "sbet"']
         lines += [f'crs = "{GEODETIC}"', f'clock = {{ system = "gps_week_seconds", week = {WEEK} }}']
         start_s = START_S + (drive.start_gps_ns - Drive.all_of(length_m)[0].start_gps_ns) / 1e9
-        Course(LINE_SPEED_M_PER_S, drive.length_m, start_s, _POSES_PER_S).write_sbet(folder / f"{drive.run}.sbet")
+        Course(LINE_SPEED_M_PER_S, drive.length_m, start_s, poses_per_s).write_sbet(folder / f"{drive.run}.sbet")
         for number, head in enumerate(sorted(HEADS)):
             log = f"{drive.run}_{head}.arrow"
             ranges = np.full((_PROFILES, _READINGS), 10_000 + number, np.uint16)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import os
 import shutil
 import tempfile
@@ -33,7 +34,7 @@ from roadscan.core.errors import DamagedError, FullDiskError, RoadscanError, Sto
 from roadscan.core.extras import need
 from roadscan.store.damage import UNREADABLE
 from roadscan.store.holding.lease import FolderPlace, Lease, ObjectPlace, changed_s
-from roadscan.store.holding.look import Look, at_once, look_of, looking
+from roadscan.store.holding.look import CONTENT_BYTES, Look, at_once, look_of, looking
 from roadscan.store.holding.process import own_tag, tag_lives
 from roadscan.store.seal import check_seal, without_seal
 from roadscan.store.written_by import VERSION_FILE, refuse_newer, version_of
@@ -55,6 +56,8 @@ _MAKE_ROOM: Final = (
     "see to more room, and run again: what is finished stays, and the next run goes on where this one stopped"
 )
 
+_AT_ONCE_BYTES: Final = 16 << 20
+"""Largest object (bytes) that is copied by one request and through memory."""
 _MANY_FILES: Final = 64
 """Files whose folders are listed, where fewer are asked for one by one: a folder may hold many others."""
 
@@ -180,6 +183,14 @@ class Store:
         if look is not None:
             look.keep(relative, content)
         return content
+
+    def opened(self, relative: str) -> Any:
+        """Return a file as a stream of bytes; a small object whose size is known comes by one request, and stays."""
+        look = self._look()
+        size = None if look is None else look.size(relative)
+        if size is not None and size <= CONTENT_BYTES:
+            return io.BytesIO(self.read_bytes(relative))
+        return self.fs.open(self.path(relative), "rb")
 
     def read_table(self, relative: str, columns: Sequence[str] | None = None, change: str = MADE_AGAIN) -> pa.Table:
         """Return a small Parquet file, its seal and its page checksums verified; `change` says how to repair it.
@@ -329,9 +340,22 @@ class Store:
         """Return the path of a local file with the content of a stored one (itself, where the store is a folder)."""
         if self.is_folder:
             return Path(self.path(relative))
-        target = folder / Path(relative).name
-        self.fs.get_file(self.path(relative), str(target))
+        target, size = folder / Path(relative).name, self.size(relative)
+        if size is None or size > _AT_ONCE_BYTES:
+            self.fs.get_file(self.path(relative), str(target))
+        else:
+            target.write_bytes(self.fs.cat_file(self.path(relative), **at_once(self.fs)))
         return target
+
+    @contextlib.contextmanager
+    def copied(self, relative: str, folder: Path) -> Iterator[Path]:
+        """Return the same; a copy is removed afterwards."""
+        local = self.local_copy(relative, folder)
+        try:
+            yield local
+        finally:
+            if not self.is_folder:
+                local.unlink(missing_ok=True)
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
@@ -352,7 +376,7 @@ class Store:
             self._lease = lease
             if self.is_folder:
                 self._clear_staging()
-            with self.looked():
+            with self.looked(anew=True):  # somebody else may have written before
                 self.check_version()
                 yield
         finally:
@@ -386,11 +410,14 @@ class Store:
         return FolderPlace(Path(file), self._new_temporary, alone_in) if self.is_folder else ObjectPlace(self.fs, file)
 
     @contextlib.contextmanager
-    def looked(self) -> Iterator[None]:
-        """Ask an object store for nothing twice, as long as nobody else writes to it (a folder is asked each time)."""
+    def looked(self, *, anew: bool = False) -> Iterator[None]:
+        """Ask an object store for nothing twice, as long as nobody else writes to it (a folder is asked each time).
+
+        What is known already holds, unless it is asked for `anew`.
+        """
         with contextlib.ExitStack() as stack:
             if not self.is_folder:
-                stack.enter_context(looking((self.url, self.survey_id), self.fs, self.root))
+                stack.enter_context(looking((self.url, self.survey_id), self.fs, self.root, anew=anew))
             yield
 
     def told(self, written: Iterable[tuple[str, int]]) -> None:

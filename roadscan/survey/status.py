@@ -24,7 +24,7 @@ from roadscan.store.damage import UNREADABLE
 from roadscan.store.history import history_faults
 from roadscan.store.logs import LogRecord, copy_path, has_log, read_log_records, record_path
 from roadscan.store.manifest import Manifest, OutputRecord, read_failures
-from roadscan.store.repair_records import fault_of
+from roadscan.store.repair_records import digest_fault, fault_of, size_fault, unread_fault
 from roadscan.store.salvage import Lost, read_lost
 from roadscan.store.stamp import Stamp, stamp_of
 from roadscan.store.store import Store
@@ -279,10 +279,17 @@ def _copy_faults(store: Store, keys: Sequence[str]) -> list[str]:
 
 
 def _check_output(store: Store, folder: Path, record: OutputRecord) -> str | None:
-    fault = fault_of(store, folder, record.path, record.bytes, record.digest)
-    if fault is not None:
+    if (fault := size_fault(store, record.path, record.bytes)) is not None:
         return fault
-    local = store.local_copy(record.path, folder)
+    try:
+        with store.copied(record.path, folder) as local:
+            return digest_fault(local, record.path, record.digest) or _unopened(local, record)
+    except OSError as error:
+        return unread_fault(record.path, error)
+
+
+def _unopened(local: Path, record: OutputRecord) -> str | None:
+    """Return why an output's file, of which `local` is a copy, is not what it should be."""
     try:
         if record.product in products():
             products()[record.product].check(local)

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Any, Final
 
-_CONTENT_BYTES: Final = 1 << 20
+CONTENT_BYTES: Final = 1 << 20
 """Largest content (bytes) that is kept: that of records and small tables …"""
 _ALL_BYTES: Final = 128 << 20
 """… and of all that are kept: those of a network's records are let go, the oldest first."""
@@ -63,7 +63,7 @@ class Look:
 
     def keep(self, path: str, content: bytes) -> None:
         """Keep the content of a file that was read."""
-        if len(content) > _CONTENT_BYTES:
+        if len(content) > CONTENT_BYTES:
             return
         self._held_bytes += len(content) - len(self._contents.pop(path, b""))
         self._contents[path] = content
@@ -140,10 +140,11 @@ _LOOKS: Final[dict[tuple[str, str], Look]] = {}
 
 
 @contextlib.contextmanager
-def looking(key: tuple[str, str], fs: Any, root: str) -> Iterator[None]:
-    """Remember what an object store holds, from now on and anew."""
+def looking(key: tuple[str, str], fs: Any, root: str, *, anew: bool = False) -> Iterator[None]:
+    """Remember what an object store holds, from now on, or go on with what is remembered; `anew` lists it again."""
     is_inner = key in _LOOKS
-    _LOOKS[key] = Look(fs, root, _LOOKS.get(key))
+    if anew or not is_inner:
+        _LOOKS[key] = Look(fs, root, _LOOKS.get(key))
     try:
         yield
     finally:

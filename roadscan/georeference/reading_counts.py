@@ -58,7 +58,7 @@ class LogCounts:
 
     def add(self, unit: str, figures: Mapping[str, Any]) -> None:
         """Add the counts that the record of a tile, or of the footprints of a data file, states."""
-        is_by_log = all(isinstance(own, dict) for own in figures.values())
+        is_by_log = isinstance(next(iter(figures.values()), {}), dict)
         for log, fates in figures.items() if is_by_log else ((log_of(unit), figures),):
             own = self._logs[log]
             for name, count in fates.items():

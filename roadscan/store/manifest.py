@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -73,9 +74,11 @@ class Manifest:
         self._parts = [_Part(one.path, one.table.num_rows) for one in read if one.fault is None]
         self._next = read[-1].number + 1 if read else 0
         self._table, self._moved = latest(pa.concat_tables([RECORDS.empty_table(), *(one.table for one in read)]))
+        pa.default_memory_pool().release_unused()  # what was read and merged is as large as the records
         self._behind: list[_Part] = []  # parts that the table does not include yet
         self._rows: dict[str, dict[str, Row]] = {}  # by product and unit, for requested products
         self._found: dict[Callable[[Manifest], Any], Any] = {}
+        self._places: dict[str, tuple[int, int]] = {}  # first row and rows of each product
 
     def get(self, product: str, unit: str) -> OutputRecord | None:
         """Return the record of an output, None where it was never finished."""
@@ -232,15 +235,22 @@ class Manifest:
         return rows
 
     def _own(self, product: str) -> pa.Table:
-        """Return the records of a product."""
+        """Return the records of a product, which stand together."""
         table = self.table()
-        return table.filter(pc.equal(table.column("product"), product))
+        if not self._places:
+            counts = table.column("product").value_counts().to_pylist()
+            ends = itertools.accumulate(one["counts"] for one in counts)
+            self._places = {
+                one["values"]: (end - one["counts"], one["counts"]) for one, end in zip(counts, ends, strict=True)
+            }
+        return table.slice(*self._places.get(product, (0, 0)))
 
     def table(self) -> pa.Table:
         """Return every record, by product and unit."""
         if self._behind:
             news, self._behind = list(map(self._read, self._behind)), []
             self._table, moved = latest(pa.concat_tables([self._table, *news]))
+            self._places.clear()
             self._moved += moved
         return self._table
 

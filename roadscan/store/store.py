@@ -139,7 +139,7 @@ class Store:
 
     def _sizes_in(self, folder: str) -> dict[str, int]:
         with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(self.path(folder)) as entries:
-            return {one.name: one.stat().st_size for one in entries if one.is_file()}
+            return {one.name: one.stat().st_size for one in entries}
         return {}
 
     def files(self, relative: str, suffix: str = "") -> list[str]:
@@ -154,6 +154,10 @@ class Store:
         found = self.fs.find(self.path(relative))
         start = len(self.fs._strip_protocol(self.root)) + 1
         return sorted(f[start:] for f in found if f.endswith(suffix))
+
+    def state(self, relative: str) -> tuple[int, str] | None:
+        """Return bytes and ETag of an object, None where only the store can tell."""
+        return None if (look := self._look()) is None else look.state(relative)
 
     def changed_s(self, relative: str) -> float:
         """Return when a file was written (Unix s), by the store's clock."""

@@ -18,6 +18,7 @@ from roadscan.ingest.overlap import NothingPlacedError
 from roadscan.ingest.planned_logs import PlannedLog, UnplannedLog, logs_of
 from roadscan.ingest.sources import damaged_sources
 from roadscan.navigation.tasks.navigate import known_keys
+from roadscan.run.engine.compute import rare_collections
 from roadscan.run.session import Session
 from roadscan.run.stage import StageState, findings_of, stages
 from roadscan.store.damage import UNREADABLE
@@ -121,7 +122,7 @@ class Status:
 
 def survey_status(session: Session) -> Status:
     """Return the state of a survey from its manifest; no readings are read."""
-    with session.store.looked():
+    with session.store.looked(), rare_collections():
         return _survey_status(session)
 
 

@@ -43,6 +43,11 @@ class Look:
         """Return the bytes of a file, None where it is not known."""
         return self._listed().get(path)
 
+    def state(self, path: str) -> tuple[int, str] | None:
+        """Return bytes and ETag of a file that is as it was listed, None where only the store can tell."""
+        size, state = self._listed().get(path), self._states.get(path)
+        return None if size is None or state is None else (size, state)
+
     def exists(self, path: str) -> bool | None:
         """Return True if the file or folder exists; None where only the store can tell."""
         if path in self._listed() or path in self._folders:

@@ -16,14 +16,21 @@ import numpy.typing as npt
 
 
 class GroupSpans(Sequence[tuple[int, int]]):
-    """Pairs of first and last epoch (GPS ns), 16 bytes each; equal to a tuple of the same pairs."""
+    """Pairs of first and last epoch (GPS ns), 8 bytes each where they lie close; equal to a tuple of the same pairs."""
 
-    __slots__ = ("_pairs",)
+    __slots__ = ("_start", "_steps")
 
     def __init__(self, pairs: Sequence[tuple[int, int]] | npt.NDArray[np.int64] = ()) -> None:
-        held = np.array(pairs, dtype=np.int64).reshape(-1, 2)
-        held.flags.writeable = False
-        self._pairs = held
+        first, last = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+        self._start = int(first[0]) if first.size else 0
+        steps = np.column_stack([np.diff(first, prepend=self._start), last - first])
+        fits = not steps.size or np.abs(steps).max() <= np.iinfo(np.int32).max
+        self._steps: npt.NDArray[Any] = steps.astype(np.int32 if fits else np.int64)
+
+    @property
+    def _pairs(self) -> npt.NDArray[np.int64]:
+        first = self._start + np.cumsum(self._steps[:, 0], dtype=np.int64)
+        return np.column_stack([first, first + self._steps[:, 1]])
 
     @classmethod
     def of_text(cls, text: str) -> Self:
@@ -47,10 +54,10 @@ class GroupSpans(Sequence[tuple[int, int]]):
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
         """Return (n, 2) epochs."""
-        return self._pairs.astype(np.int64 if dtype is None else dtype, copy=copy is not False)
+        return self._pairs.astype(np.int64 if dtype is None else dtype, copy=False)
 
     def __len__(self) -> int:
-        return len(self._pairs)
+        return len(self._steps)
 
     @overload
     def __getitem__(self, place: int) -> tuple[int, int]: ...
@@ -61,7 +68,7 @@ class GroupSpans(Sequence[tuple[int, int]]):
     def __getitem__(self, place: int | slice) -> tuple[int, int] | GroupSpans:
         if isinstance(place, slice):
             return GroupSpans(self._pairs[place])
-        first, last = self._pairs[place].tolist()
+        first, last = map(int, self._pairs[place])
         return first, last
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
@@ -76,7 +83,7 @@ class GroupSpans(Sequence[tuple[int, int]]):
         return hash(self._pairs.tobytes())
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return GroupSpans, (np.array(self._pairs),)
+        return GroupSpans, (self._pairs,)
 
     def __repr__(self) -> str:
         return f"GroupSpans({list(self)!r})"

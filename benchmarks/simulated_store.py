@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -222,3 +223,21 @@ def _write_logs(folder: Path, name: str, length_m: float, store: str, poses_per_
     file = folder / "SURVEY.toml"
     file.write_text("\n".join(lines) + "\n")
     return file
+
+
+def simulated_fleet(folder: Path, surveys: int, length_m: float) -> Path:
+    """A folder of surveys of that length: the first with all its files, the others copies of it without tiles."""
+    first = simulated_survey(folder / "s000", "s000", length_m)
+    survey = Survey.load(first)
+    run_stages(Session(survey, Store(survey.store_url, "s000"), TinyFiles(length_m)))
+    for number in range(1, surveys):
+        name = f"s{number:03d}"
+        place = folder / name
+        place.mkdir()
+        (place / first.name).write_text(first.read_text().replace('"s000"', f'"{name}"'))
+        for log in first.parent.glob("run*"):
+            (place / log.name).hardlink_to(log)
+        held = first.parent / "store" / "survey=s000"
+        for part in ("manifest", "tables", "products"):
+            shutil.copytree(held / part, place / "store" / f"survey={name}" / part)
+    return folder

@@ -34,7 +34,7 @@ from roadscan.core.errors import DamagedError, FullDiskError, RoadscanError, Sto
 from roadscan.core.extras import need
 from roadscan.store.damage import UNREADABLE
 from roadscan.store.holding.lease import FolderPlace, Lease, ObjectPlace, changed_s
-from roadscan.store.holding.look import CONTENT_BYTES, Look, at_once, look_of, looking
+from roadscan.store.holding.look import Look, at_once, look_of, looking
 from roadscan.store.holding.process import own_tag, tag_lives
 from roadscan.store.seal import check_seal, without_seal
 from roadscan.store.written_by import VERSION_FILE, refuse_newer, version_of
@@ -189,10 +189,10 @@ class Store:
         return content
 
     def opened(self, relative: str) -> Any:
-        """Return a file as a stream of bytes; a small object whose size is known comes by one request, and stays."""
+        """Return a file as a stream of bytes; an object whose size is known to be small comes by one request."""
         look = self._look()
         size = None if look is None else look.size(relative)
-        if size is not None and size <= CONTENT_BYTES:
+        if size is not None and size <= _AT_ONCE_BYTES:
             return io.BytesIO(self.read_bytes(relative))
         return self.fs.open(self.path(relative), "rb")
 

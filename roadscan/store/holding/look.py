@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Iterator
 from typing import Any, Final
 
-CONTENT_BYTES: Final = 1 << 20
+_CONTENT_BYTES: Final = 1 << 20
 """Largest content (bytes) that is kept: that of records and small tables …"""
 _ALL_BYTES: Final = 128 << 20
 """… and of all that are kept: those of a network's records are let go, the oldest first."""
@@ -68,7 +68,7 @@ class Look:
 
     def keep(self, path: str, content: bytes) -> None:
         """Keep the content of a file that was read."""
-        if len(content) > CONTENT_BYTES:
+        if len(content) > _CONTENT_BYTES:
             return
         self._held_bytes += len(content) - len(self._contents.pop(path, b""))
         self._contents[path] = content

@@ -19,7 +19,7 @@ _STATUS_S, _STATUS_MB = 5.0, 500.0
 _REQUESTS = 100.0
 """Bar of an idle run on 10,000 objects."""
 _POSES_PER_S = 200
-"""As a real drive has in the object store: their files are too large to be kept in memory."""
+"""Of the survey in the object store, as a real drive has them."""
 _FLEET_KM = 1.0
 
 

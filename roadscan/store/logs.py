@@ -15,8 +15,8 @@ import numpy as np
 from roadscan.core.errors import DamagedError, StoreError
 from roadscan.core.witness import Finding
 from roadscan.store.checked_json import checked_json, parse_checked
+from roadscan.store.codecs.group_spans import GroupSpans
 from roadscan.store.digest import bytes_digest
-from roadscan.store.readings.group_spans import GroupSpans
 from roadscan.store.store import Store
 
 _FOLDER: Final = "manifest/logs"

@@ -6,8 +6,8 @@ import pickle
 
 import numpy as np
 
+from roadscan.store.codecs.group_spans import GroupSpans
 from roadscan.store.logs import DataFile, data_file
-from roadscan.store.readings.group_spans import GroupSpans
 
 GROUPS = 100_000
 

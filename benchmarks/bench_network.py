@@ -4,6 +4,7 @@ Everything but the readings is real: plans and tasks of the stages, a Dask sched
 processes of their own, and the loops that hand tasks out and keep the records. A survey is a day's drive; footprints
 and tiles of all are scheduled as in a run, products of one. The network is run twice: its graph alone, where a task of
 tiles ends at once and leaves nothing, and then with four records of each tile, which are made, packed, sent and kept.
+At last commands run on stores that are kept, with tiny files.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from typing import Any, TypeAlias
 
 import psutil
 
+from benchmarks.kept_stores import of_fleet, of_folder, of_object_store
 from benchmarks.network import Region
 from benchmarks.scheduler import Watched, running_scheduler
 from benchmarks.settings import Settings
@@ -101,6 +103,9 @@ def figures(folder: Path) -> Iterator[Figure]:
     yield Figure(f"{name}: peak memory of the scheduler", peak / 2**20, "MiB")
     yield Figure(f"{name}: growth of the planning process", grown / 2**20, "MiB")
     yield from _of_stage("products", seen.products)
+    yield from of_folder(folder / "large", size.status_km)
+    yield from of_object_store(folder / "objects", size.objects_km)
+    yield from of_fleet(folder / "fleet", size.fleet_surveys)
 
 
 def _all(first: Region, folder: Path, regions: int, client: Any, scheduler: Watched, work: _Work) -> _Seen:

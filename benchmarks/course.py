@@ -25,7 +25,6 @@ LEAP_S = 18
 IMU_HEIGHT_M = 1.4
 CROSSFALL = 0.025
 
-_POSES_PER_S = 200
 _LEAD_S = 1.0
 _ORIGIN_M = (563_210.0, 5_934_870.0)
 _HEIGHT_M = 87.0
@@ -46,11 +45,14 @@ class Course:
 
     speed_m_per_s: float
     length_m: float
+    start_s: float = START_S
+    """Second of the GPS week at station 0."""
+    poses_per_s: int = 200
 
     def write_sbet(self, file: Path) -> None:
-        """Write 200 exact poses a second, from a second before station 0 to a second after the end."""
-        poses = round((self.length_m / self.speed_m_per_s + 2 * _LEAD_S) * _POSES_PER_S) + 1
-        since_start_s = np.arange(poses) / _POSES_PER_S - _LEAD_S
+        """Write exact poses, from a second before station 0 to a second after the end."""
+        poses = round((self.length_m / self.speed_m_per_s + 2 * _LEAD_S) * self.poses_per_s) + 1
+        since_start_s = np.arange(poses) / self.poses_per_s - _LEAD_S
         station_m = since_start_s * self.speed_m_per_s
         easting, northing = self._places(poses)
         to_geodetic = pyproj.Transformer.from_crs(CRS, GEODETIC, always_xy=True)
@@ -59,7 +61,7 @@ class Course:
         phase = 2 * math.pi * station_m / _PERIOD_M
         climb_m = _GRADE * _PERIOD_M / (2 * math.pi) * (1 - np.cos(phase))
         rows = np.zeros((poses, 17))
-        rows[:, 0] = START_S + since_start_s
+        rows[:, 0] = self.start_s + since_start_s
         rows[:, 1], rows[:, 2] = np.radians(latitude), np.radians(longitude)
         rows[:, 3] = _HEIGHT_M + climb_m + IMU_HEIGHT_M + heave_m(since_start_s)
         rows[:, 7] = math.atan(CROSSFALL)
@@ -69,8 +71,8 @@ class Course:
 
     def _places(self, poses: int) -> tuple[Float64, Float64]:
         """Easting and northing of the poses: the heading's integral by Simpson's rule."""
-        ends = np.arange((poses - 1) * _STEPS + 1) / (_POSES_PER_S * _STEPS) - _LEAD_S
-        step_m = self.speed_m_per_s / (_POSES_PER_S * _STEPS)
+        ends = np.arange((poses - 1) * _STEPS + 1) / (self.poses_per_s * _STEPS) - _LEAD_S
+        step_m = self.speed_m_per_s / (self.poses_per_s * _STEPS)
         middles = ends[:-1] * self.speed_m_per_s + step_m / 2
         at_ends, at_middles = _heading(ends * self.speed_m_per_s), _heading(middles)
         out = []

@@ -38,7 +38,9 @@ TILE_M = 10.0
 _REGION_TILES = 5000
 """From region to region on the map, ten in a row."""
 _RUNS = 2
-_HEADS = {"left": (-1.98, -1.0, 0.02), "right": (-0.02, 1.0, 1.98)}
+_APART_H = 4
+"""From the start of a run to that of the next (h)."""
+HEADS = {"left": (-1.98, -1.0, 0.02), "right": (-0.02, 1.0, 1.98)}
 """Offsets (m, right positive) at which the strip of each head is looked at."""
 _READINGS = 2000
 _READING_BYTES = 1.3
@@ -49,6 +51,80 @@ _ORIGIN_M = (563_210.0, 5_934_870.0)
 _AZIMUTH = math.radians(37.0)
 _MANY = 1_000_000
 """More than there are columns."""
+_GROUP_ROWS = table_schema("scans").row_group_rows
+_PERIOD_NS = round(1e9 * _GROUP_ROWS * LINE_SPACING_M / LINE_SPEED_M_PER_S)
+"""From row group to row group."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A run of a survey, in row groups of profiles."""
+
+    number: int
+    start_gps_ns: int
+    groups: int
+
+    @classmethod
+    def all_of(cls, length_m: float) -> list[Drive]:
+        """The runs of a survey of that length, hours apart."""
+        groups = math.ceil(length_m / _RUNS / (_GROUP_ROWS * LINE_SPACING_M))
+        return [cls(run, START_GPS_NS + run * _APART_H * 3600 * 10**9, groups) for run in range(_RUNS)]
+
+    @property
+    def run(self) -> str:
+        """Its name."""
+        return f"run{self.number}"
+
+    @property
+    def end_gps_ns(self) -> int:
+        """When its last row group ends."""
+        return self.start_gps_ns + _PERIOD_NS * self.groups
+
+    @property
+    def length_m(self) -> float:
+        """Way that it drives."""
+        return self.groups * _GROUP_ROWS * LINE_SPACING_M
+
+    def files(self, head: str, key: str) -> tuple[DataFile, ...]:
+        """Data files of a head's log of that key: one a partition of GPS time."""
+        bin_s = table_schema("scans").partition_s or 3600
+        epochs = self.start_gps_ns + _PERIOD_NS * np.arange(self.groups)
+        spans = list(zip(epochs.tolist(), (epochs + _PERIOD_NS - _PERIOD_NS // _GROUP_ROWS).tolist(), strict=True))
+        edges = np.flatnonzero(np.diff(epochs // (bin_s * 10**9), prepend=-1, append=-1))
+        folder = f"tables/scans/run={self.run}/sensor={head}/log={key}"
+        return tuple(
+            DataFile(
+                f"{folder}/gps_bin_s={int(epochs[a]) // 10**9 // bin_s * bin_s}/part-00000.parquet",
+                (b - a) * _GROUP_ROWS, int((b - a) * _GROUP_ROWS * _READINGS * _READING_BYTES), key_of(key, int(a)),
+                (_GROUP_ROWS,) * int(b - a), tuple(spans[a:b]),
+            )
+            for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)
+        )  # fmt: skip
+
+    def touched(self, head: str, files: tuple[DataFile, ...]) -> dict[str, Int64]:
+        """Runs of row groups that touch a tile: columns of the footprints, `file` is the number in `files`."""
+        counts = np.array([len(f.group_rows) for f in files])
+        file, before = np.repeat(np.arange(counts.size), counts), np.cumsum(counts) - counts
+        groups = int(counts.sum())
+        east, north, azimuth = _road(self.number, _GROUP_ROWS * LINE_SPACING_M, groups)
+        found: list[Int64] = []
+        for offset in HEADS[head]:
+            column = np.floor((east + offset * np.cos(azimuth)) / TILE_M).astype(np.int64)
+            row = np.floor((north - offset * np.sin(azimuth)) / TILE_M).astype(np.int64)
+            place = row * _MANY + column
+            found += [place[:-1] * groups + np.arange(groups), place[1:] * groups + np.arange(groups)]
+        place, group = np.divmod(np.unique(np.concatenate(found)), groups)
+        breaks = (np.diff(place) != 0) | (np.diff(group) != 1) | (np.diff(file[group]) != 0)
+        starts = np.flatnonzero(np.concatenate([[True], breaks]))
+        first, last = group[starts], group[np.append(starts[1:], group.size) - 1]
+        spans = np.array([span for f in files for span in f.group_spans])
+        row, column = np.divmod(place[starts], _MANY)
+        readings = (last - first + 1) * _GROUP_ROWS * _READINGS
+        return {
+            "tile_column": column, "tile_row": row, "file": file[first], "first_group": first - before[file[first]],
+            "last_group": last - before[file[first]], "readings": readings,
+            "first_epoch_gps_ns": spans[first, 0], "last_epoch_gps_ns": spans[last, 1],
+        }  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -75,19 +151,14 @@ class Region:
     def of(cls, length_m: float, folder: Path) -> Region:
         """A drive of that length."""
         survey = Survey.parse(_settings("region"), folder=folder)
-        group_rows = table_schema("scans").row_group_rows
-        groups = math.ceil(length_m / _RUNS / (group_rows * LINE_SPACING_M))
         sources, passes, rows = [], [], []
-        for run in range(_RUNS):
-            start = START_GPS_NS + run * 4 * 3600 * 10**9
-            period = round(1e9 * group_rows * LINE_SPACING_M / LINE_SPEED_M_PER_S)
-            epochs = start + period * np.arange(groups)
-            passes.append(LanePass(PassId(run + 1), RunId(f"run{run}"), start, int(epochs[-1]) + period))
-            for head in sorted(_HEADS):
-                source = _source(f"run{run}", head, start, int(epochs[-1]) + period)
-                files = _files(source, epochs, period, group_rows)
+        for drive in Drive.all_of(length_m):
+            passes.append(LanePass(PassId(drive.number + 1), RunId(drive.run), drive.start_gps_ns, drive.end_gps_ns))
+            for head in sorted(HEADS):
+                source = _source(drive.run, head, drive.start_gps_ns, drive.end_gps_ns)
+                files = drive.files(head, source.key)
                 sources.append((source, files))
-                rows.append(_touched(run, head, files))
+                rows.append(drive.touched(head, files))
         grid = TileGrid(survey.config.tiles.size_m, survey.config.tiles.cell_m)
         plan = SurveyPlan(
             survey=survey,
@@ -105,7 +176,7 @@ class Region:
 def _settings(survey_id: str) -> dict[str, object]:
     return {
         "id": survey_id,
-        "rig": {"sensors": {head: {"kind": "profiler"} for head in sorted(_HEADS)}},
+        "rig": {"sensors": {head: {"kind": "profiler"} for head in sorted(HEADS)}},
         "map": {"crs": CRS, "height": "ellipsoidal"},
         "tiles": {"size_m": TILE_M, "cell_m": 0.005},
         "runs": [{"id": f"run{run}", "logs": [{"path": "poses.sbet", "format": "sbet"}]} for run in range(_RUNS)],
@@ -131,22 +202,6 @@ def _source(run: str, head: str, start: int, end: int) -> ReadingSource:
     )  # fmt: skip
 
 
-def _files(source: ReadingSource, epochs: Int64, period: int, group_rows: int) -> tuple[DataFile, ...]:
-    """Its data files: one a partition of GPS time."""
-    bin_s = table_schema("scans").partition_s or 3600
-    spans = list(zip(epochs.tolist(), (epochs + period - period // group_rows).tolist(), strict=True))
-    edges = np.flatnonzero(np.diff(epochs // (bin_s * 10**9), prepend=-1, append=-1))
-    folder = f"tables/scans/run={source.run}/sensor={source.sensor}/log={source.key}"
-    return tuple(
-        DataFile(
-            f"{folder}/gps_bin_s={int(epochs[a]) // 10**9 // bin_s * bin_s}/part-00000.parquet",
-            (b - a) * group_rows, int((b - a) * group_rows * _READINGS * _READING_BYTES), key_of(source.key, int(a)),
-            (group_rows,) * int(b - a), tuple(spans[a:b]),
-        )
-        for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)
-    )  # fmt: skip
-
-
 def _road(run: int, step_m: float, groups: int) -> tuple[Float64, Float64, Float64]:
     """Easting, northing and azimuth at the ends of row groups: winding legs beside one another, oblique to the grid."""
     leg, place = np.divmod(step_m * np.arange(groups + 1), _LEG_M)
@@ -156,32 +211,6 @@ def _road(run: int, step_m: float, groups: int) -> tuple[Float64, Float64, Float
     east, north = (along - along[begin][np.cumsum(begin) - 1] for along in (east, north))
     number = run * math.ceil(groups * step_m / _LEG_M) + leg
     return _ORIGIN_M[0] + east, _ORIGIN_M[1] + north + _APART_M * number, azimuth
-
-
-def _touched(run: int, head: str, files: tuple[DataFile, ...]) -> dict[str, Int64]:
-    """Runs of row groups that touch a tile: columns of the footprints, `file` is the number in `files`."""
-    counts = np.array([len(f.group_rows) for f in files])
-    file, before = np.repeat(np.arange(counts.size), counts), np.cumsum(counts) - counts
-    groups = int(counts.sum())
-    east, north, azimuth = _road(run, table_schema("scans").row_group_rows * LINE_SPACING_M, groups)
-    found: list[Int64] = []
-    for offset in _HEADS[head]:
-        column = np.floor((east + offset * np.cos(azimuth)) / TILE_M).astype(np.int64)
-        row = np.floor((north - offset * np.sin(azimuth)) / TILE_M).astype(np.int64)
-        place = row * _MANY + column
-        found += [place[:-1] * groups + np.arange(groups), place[1:] * groups + np.arange(groups)]
-    place, group = np.divmod(np.unique(np.concatenate(found)), groups)
-    breaks = (np.diff(place) != 0) | (np.diff(group) != 1) | (np.diff(file[group]) != 0)
-    starts = np.flatnonzero(np.concatenate([[True], breaks]))
-    first, last = group[starts], group[np.append(starts[1:], group.size) - 1]
-    spans = np.array([span for f in files for span in f.group_spans])
-    row, column = np.divmod(place[starts], _MANY)
-    readings = (last - first + 1) * table_schema("scans").row_group_rows * _READINGS
-    return {
-        "tile_column": column, "tile_row": row, "file": file[first], "first_group": first - before[file[first]],
-        "last_group": last - before[file[first]], "readings": readings,
-        "first_epoch_gps_ns": spans[first, 0], "last_epoch_gps_ns": spans[last, 1],
-    }  # fmt: skip
 
 
 def _joined(plan: SurveyPlan, parts: list[dict[str, Int64]]) -> FootprintRanges:

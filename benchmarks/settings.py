@@ -34,6 +34,12 @@ class Settings:
     """Length of the network whose scheduling is tried."""
     network_region_km: float = 200.0
     """Length of each of its surveys."""
+    status_km: float = 602.0
+    """Length of the survey whose `status` is timed: 100,000 tiles, 1.6 GB of disk in tiny files."""
+    objects_km: float = 14.6
+    """Length of the survey in the object store: 10,000 objects."""
+    fleet_surveys: int = 20
+    """Surveys of a kilometre whose catalogue is made."""
     adjustment_km: float = 100.0
     """Length of the road whose passes are adjusted."""
     adjustment_seeds: int = 10

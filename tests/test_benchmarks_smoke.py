@@ -18,7 +18,7 @@ pytestmark = [pytest.mark.nightly, pytest.mark.timeout(1800)]
 
 WHOLE = {
     "line_rate": "pair_m=2 hdl_s=2 sick_s=30 repeats=1 sample_m=0 las_points=100000",
-    "network": "network_km=40 network_region_km=20",
+    "network": "network_km=40 network_region_km=20 status_km=1 objects_km=0.3 fleet_surveys=2",
     "parts": "pair_m=2 hdl_s=2 repeats=1",
     "reference_logs": "reference_m=120 reference_runs=2 workers=0",
     "scaling": "scaling_km=0.05,0.1 scaling_spacing_mm=500 repeats=1",

@@ -13,7 +13,7 @@ from roadscan.adjust.tasks.outcome import FOLDER, TABLES, known_findings, known_
 from roadscan.core.errors import ConfigError, RoadscanError
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
-from roadscan.footprints.footprints import footprints_of, index_footprints
+from roadscan.footprints.footprints import footprints_of, index_footprints, join_footprints
 from roadscan.georeference.plan.plan import plan_of, poses_plan_of
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState
@@ -52,6 +52,7 @@ class Adjust(Stage):
         session.take(plan_of, plan_of(session).corrected_anew())
         # Corrections beyond the margin of footprints make these anew, and nothing else does.
         found = index_footprints(plan_of(session), session.manifest, session.compute, session.bar("footprints"))
+        join_footprints(plan_of(session), session.manifest)
         session.forget(footprints_of)
         session.failed(self.name, found)
 

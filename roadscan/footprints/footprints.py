@@ -32,6 +32,7 @@ from roadscan.run.stage import StageState
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
+from roadscan.store.seal import sealed_parquet
 from roadscan.store.store import Store
 from roadscan.store.writer import parquet_bytes
 
@@ -45,6 +46,12 @@ _CLOUD_GROUPS = 8
 _LOADED: Final = [
     "tile_column", "tile_row", "first_group", "last_group", "readings", "first_epoch_gps_ns", "last_epoch_gps_ns",
 ]  # fmt: skip
+_NUMBER: Final = "slice_index"
+JOINED = "footprints_joined"
+"""Manifest name of the file with the footprints of all data files."""
+_ALL: Final = "all"
+_JOINED_FILE: Final = "manifest/footprints.parquet"
+_JOINED_ROWS: Final = pa.schema([table_schema(PRODUCT).arrow().field(n) for n in _LOADED] + [(_NUMBER, pa.int32())])
 
 
 @dataclass(frozen=True)
@@ -256,14 +263,15 @@ def load_ranges(
 
     A data file without footprints is left out (its indexing failed); one outside the window is not opened.
     """
-    slices = sorted(
-        plan.slices(), key=lambda s: (s.source.run, s.source.sensor, s.source.key, s.spans[0] if s.spans else (0, 0))
-    )
+    slices = _in_order(plan)
     if not manifest.of(PRODUCT):
         raise StoreError("the survey has no footprints", change="run `roadscan footprints` first")
     wanted = None if window is None else _in_window(window)
-    tables: list[pa.Table] = [table_schema(PRODUCT).arrow().empty_table().select(_LOADED)]
-    numbers: list[npt.NDArray[np.int32]] = [np.zeros(0, np.int32)]
+    whole = manifest.get(JOINED, _ALL) if files is None and window is None else None
+    if whole is not None and whole.key == _key_of_joined(slices, manifest):
+        rows = plan.store.parse_table(read_recorded(plan.store, whole), whole.path)
+        return _ranges_of(rows, slices)
+    tables: list[pa.Table] = [_JOINED_ROWS.empty_table()]
     for number, one in enumerate(slices):
         record = manifest.get(PRODUCT, one.file)
         if record is None or (files is not None and one.file not in files) or _is_apart(record, window):
@@ -271,11 +279,42 @@ def load_ranges(
         table = plan.store.parse_table(read_recorded(plan.store, record), record.path, _LOADED)
         if wanted is not None:
             table = table.filter(wanted)
-        tables.append(table)
-        numbers.append(np.full(table.num_rows, number, np.int32))
-    rows = pa.concat_tables(tables)
-    column = {c: rows.column(c).to_numpy() for c in _LOADED}
-    return FootprintRanges(**column, slice_index=np.concatenate(numbers), slices=tuple(slices))
+        numbers = pa.array(np.full(table.num_rows, number, np.int32))
+        tables.append(table.append_column(_NUMBER, numbers).cast(_JOINED_ROWS))
+    return _ranges_of(pa.concat_tables(tables), slices)
+
+
+def join_footprints(plan: SurveyPlan, manifest: Manifest) -> None:
+    """Keep the footprints of all data files in one file, too, where that is not done: a survey has thousands of them,
+    and each run and `status` asks for all.
+    """
+    slices = _in_order(plan)
+    key = _key_of_joined(slices, manifest)
+    if not manifest.of(PRODUCT) or manifest.is_current(JOINED, _ALL, key):
+        return
+    found = load_ranges(plan, manifest)
+    columns = {name: getattr(found, name) for name in _LOADED} | {_NUMBER: found.slice_index}
+    content = sealed_parquet(pa.table(columns, schema=_JOINED_ROWS), compression="zstd")
+    plan.store.write_bytes(_JOINED_FILE, content, lasting=False)
+    manifest.add([OutputRecord(JOINED, _ALL, key, _JOINED_FILE, len(content), bytes_digest(content))])
+
+
+def _in_order(plan: SurveyPlan) -> list[RawSlice]:
+    """Return all data files by run, sensor and time."""
+    return sorted(
+        plan.slices(), key=lambda s: (s.source.run, s.source.sensor, s.source.key, s.spans[0] if s.spans else (0, 0))
+    )
+
+
+def _key_of_joined(slices: Sequence[RawSlice], manifest: Manifest) -> str:
+    """Return the key of the file with all footprints: the data files in their order, and the footprints of each."""
+    known = ((one.file, manifest.get(PRODUCT, one.file)) for one in slices)
+    return key_of(_LOADED, [(file, record and record.digest) for file, record in known])
+
+
+def _ranges_of(rows: pa.Table, slices: Sequence[RawSlice]) -> FootprintRanges:
+    column = {name: rows.column(name).to_numpy() for name in _LOADED}
+    return FootprintRanges(**column, slice_index=rows.column(_NUMBER).to_numpy(), slices=tuple(slices))
 
 
 def _in_window(window: Window) -> pc.Expression:

@@ -13,6 +13,7 @@ from roadscan.footprints.footprints import (
     footprint_state,
     footprints_of,
     index_footprints,
+    join_footprints,
     unplaced_logs,
 )
 from roadscan.georeference.plan.plan import empty_passes, plan_of
@@ -48,6 +49,7 @@ class Footprints(Stage):
         for note in outdated_calibrations(plan):
             session.note(note)
         found = index_footprints(plan, manifest, session.compute, session.bar(self.name))
+        join_footprints(plan, manifest)
         session.forget(footprints_of)
         found += check_tick_clocks(plan, manifest, session.compute, session.bar("clocks by ticks"))
         session.failed(self.name, [*found, *unplaced_logs(plan, manifest)])

@@ -44,20 +44,47 @@ def _counts(fates: npt.NDArray[np.int64]) -> dict[str, int]:
     return {name: int(n) for name, n in zip(FATE_NAMES[:COUNTED_FATES], counts, strict=True) if n}
 
 
-def counts_by_log(records: Iterable[OutputRecord]) -> dict[str, dict[str, int]]:
-    """Sum readings by outcome over the records of tiles and footprints, by the key of their log.
+class LogCounts:
+    """Sums of readings by outcome, by the key of their log.
 
     Footprints report clouds, which are read for them, and row groups that touch no tile. Tiles of older versions do not
     name the log; their readings have the key "".
     """
-    logs: dict[str, dict[str, int]] = defaultdict(lambda: dict.fromkeys(FATE_NAMES, 0))
-    for record in records:
-        figures: dict[str, Any] = record.figures().get("fates", {})
-        is_by_log = all(isinstance(own, dict) for own in figures.values())
-        for log, fates in figures.items() if is_by_log else ((log_of(record.unit), figures),):
+
+    def __init__(self, records: Iterable[OutputRecord] = ()) -> None:
+        self._logs: dict[str, dict[str, int]] = defaultdict(lambda: dict.fromkeys(FATE_NAMES, 0))
+        for record in records:
+            self.add(record.unit, record.figures().get("fates", {}))
+
+    def add(self, unit: str, figures: Mapping[str, Any]) -> None:
+        """Add the counts that the record of a tile, or of the footprints of a data file, states."""
+        is_by_log = isinstance(next(iter(figures.values()), {}), dict)
+        for log, fates in figures.items() if is_by_log else ((log_of(unit), figures),):
+            own = self._logs[log]
             for name, count in fates.items():
-                logs[log][name] += count
-    return {log: {name: count for name, count in fates.items() if count} for log, fates in sorted(logs.items())}
+                own[name] += count
+
+    def __add__(self, other: LogCounts) -> LogCounts:
+        """Return the sums of both."""
+        both = LogCounts()
+        for one in (self, other):
+            for log, fates in one.by_log().items():
+                both.add("", {log: fates})
+        return both
+
+    def by_log(self) -> dict[str, dict[str, int]]:
+        """Return the counts by log, without outcomes that no reading had."""
+        logs = sorted(self._logs.items())
+        return {log: {name: count for name, count in fates.items() if count} for log, fates in logs}
+
+    def of_all(self) -> dict[str, int]:
+        """Return the counts of all logs together."""
+        return of_all(self.by_log())
+
+
+def counts_by_log(records: Iterable[OutputRecord]) -> dict[str, dict[str, int]]:
+    """Sum readings by outcome over the records of tiles and footprints, by the key of their log."""
+    return LogCounts(records).by_log()
 
 
 def reading_counts(records: Iterable[OutputRecord]) -> dict[str, int]:

@@ -86,14 +86,13 @@ def _stands(record: LogRecord, table: str) -> bool:
 
 def _share(record: LogRecord, table: str) -> float:
     """Return the share of a table's rows in row groups with one stamp; single rows are ignored."""
-    groups = [
-        (rows, first == last)
-        for file in record.tables.get(table, ())
-        for rows, (first, last) in zip(file.group_rows, file.group_spans, strict=True)
-        if rows > 1
-    ]
-    total = sum(rows for rows, _ in groups)
-    return sum(rows for rows, is_one in groups if is_one) / total if total else 0.0
+    total = standing = 0
+    for file in record.tables.get(table, ()):
+        rows, (first, last) = np.array(file.group_rows, np.int64), np.array(file.group_spans, np.int64).T
+        several = rows > 1
+        total += int(rows[several].sum())
+        standing += int(rows[several & (first == last)].sum())
+    return standing / total if total else 0.0
 
 
 def _fault(record: LogRecord, table: str) -> Fault:

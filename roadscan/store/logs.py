@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
+from weakref import WeakValueDictionary
+
+import numpy as np
 
 from roadscan.core.errors import DamagedError, StoreError
 from roadscan.core.witness import Finding
 from roadscan.store.checked_json import checked_json, parse_checked
+from roadscan.store.codecs.group_spans import GroupSpans
+from roadscan.store.digest import bytes_digest
 from roadscan.store.store import Store
 
 _FOLDER: Final = "manifest/logs"
@@ -18,6 +24,9 @@ _COPIES: Final = "manifest/log_copies"
 
 NAVIGATION: Final = "navigation"
 """Sensor in the records of computed trajectories."""
+
+_HELD: Final[WeakValueDictionary[tuple[str, str], LogRecord]] = WeakValueDictionary()
+"""Records that somebody holds, by file and digest of its content: a run and `status` ask for them again and again."""
 
 
 @dataclass(frozen=True)
@@ -32,15 +41,24 @@ class DataFile:
     """BLAKE3-128 of its bytes with the prefix ``blake3:``; without a prefix, BLAKE2b-128 (older versions)."""
     group_rows: tuple[int, ...]
     """Rows of each row group."""
-    group_spans: tuple[tuple[int, int], ...]
-    """First and last epoch (GPS ns) of each row group; empty for tables without epochs."""
+    group_spans: Sequence[tuple[int, int]]
+    """First and last epoch (GPS ns) of each row group, held as :class:`GroupSpans`; empty for tables without epochs."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.group_spans, GroupSpans):
+            object.__setattr__(self, "group_spans", GroupSpans(self.group_spans))
 
     @cached_property
     def span(self) -> tuple[int, int] | None:
         """First and last epoch (GPS ns)."""
-        if not self.group_spans:
-            return None
-        return min(s[0] for s in self.group_spans), max(s[1] for s in self.group_spans)
+        first, last = np.array(self.group_spans).T
+        return (int(first.min()), int(last.max())) if first.size else None
+
+    def as_json(self) -> dict[str, Any]:
+        """Return its entry in a record: equal rows of neighbouring groups as [groups, rows], spans as a text."""
+        runs = [[len(list(own)), rows] for rows, own in itertools.groupby(self.group_rows)]
+        packed = {"group_rows": runs, "group_spans": GroupSpans(self.group_spans).text()}
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)} | packed
 
 
 @dataclass(frozen=True)
@@ -105,7 +123,10 @@ def copy_path(key: str) -> str:
 
 def write_log_record(store: Store, record: LogRecord) -> None:
     """Make a log part of the store."""
-    content = checked_json(dataclasses.asdict(record))
+    values = {field.name: getattr(record, field.name) for field in dataclasses.fields(record)}
+    tables = {name: [one.as_json() for one in files] for name, files in record.tables.items()}
+    findings = [dataclasses.asdict(one) for one in record.findings]
+    content = checked_json(values | {"tables": tables, "findings": findings})
     store.write_bytes(copy_path(record.key), content, lasting=False)
     store.write_bytes(record_path(record.key), content)
 
@@ -163,13 +184,19 @@ def retire_log(store: Store, record: LogRecord) -> None:
 
 
 def data_file(raw: Mapping[str, Any]) -> DataFile:
-    """Return a data file's entry in a record, from JSON."""
-    spans = tuple((s[0], s[1]) for s in raw["group_spans"])
-    return DataFile(**{**raw, "group_rows": tuple(raw["group_rows"]), "group_spans": spans})
+    """Return a data file from its entry in a record; older versions wrote each row group by itself."""
+    rows, spans = raw["group_rows"], raw["group_spans"]
+    if isinstance(spans, str):
+        rows = itertools.chain.from_iterable(itertools.repeat(n, groups) for groups, n in rows)
+    held = GroupSpans.of_text(spans) if isinstance(spans, str) else GroupSpans(spans)
+    return DataFile(**{**raw, "group_rows": tuple(rows), "group_spans": held})
 
 
 def parse_log_record(content: bytes, key: str, path: str) -> LogRecord:
     """Return the record of the log `key`, from the content of the file `path`."""
+    known = (path, bytes_digest(content))
+    if (held := _HELD.get(known)) is not None:
+        return held
     try:
         raw = parse_checked(content)
         raw["tables"] = {name: tuple(map(data_file, files)) for name, files in raw["tables"].items()}
@@ -183,4 +210,5 @@ def parse_log_record(content: bytes, key: str, path: str) -> LogRecord:
             change="the next run puts its copy in its place, or reads the log again",
             file=path,
         ) from error
+    _HELD[known] = record
     return record

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import json
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, TypeVar, cast
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -33,8 +35,12 @@ DAMAGED: Final = "damaged"
 """Its file is not as recorded."""
 _MOST_PARTS: Final = 256
 """Most parts before they are merged: a long run would start by reading thousands of files."""
+_BATCH_ROWS: Final = 4096
+"""Records that become Python objects together."""
 _LOOKS: Final = 10
 """Most times that parts are listed while another run merges them."""
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -68,8 +74,11 @@ class Manifest:
         self._parts = [_Part(one.path, one.table.num_rows) for one in read if one.fault is None]
         self._next = read[-1].number + 1 if read else 0
         self._table, self._moved = latest(pa.concat_tables([RECORDS.empty_table(), *(one.table for one in read)]))
+        pa.default_memory_pool().release_unused()  # what was read and merged is as large as the records
         self._behind: list[_Part] = []  # parts that the table does not include yet
         self._rows: dict[str, dict[str, Row]] = {}  # by product and unit, for requested products
+        self._found: dict[Callable[[Manifest], Any], Any] = {}
+        self._places: dict[str, tuple[int, int]] = {}  # first row and rows of each product
 
     def get(self, product: str, unit: str) -> OutputRecord | None:
         """Return the record of an output, None where it was never finished."""
@@ -90,6 +99,23 @@ class Manifest:
         own = pc.is_in(table.column("product"), pa.array(sorted(products), pa.string()))
         due = pc.is_in(table.column("unit"), pa.array(list(units), pa.string()))
         return list(map(OutputRecord._make, rows_of(table.filter(pc.and_not(own, due)))))
+
+    def chosen(self, product: str, units: Collection[str]) -> list[OutputRecord]:
+        """Return the records of some units of a product, without those that have none."""
+        table = self._own(product)
+        named = pc.is_in(table.column("unit"), pa.array(list(units), pa.string()))
+        return list(map(OutputRecord._make, rows_of(table.filter(named))))
+
+    def column(self, product: str, *names: str) -> Iterator[tuple[Any, ...]]:
+        """Yield some values of each record of a product, by unit; few of them are Python objects at a time."""
+        for batch in self._own(product).select(names).to_batches(max_chunksize=_BATCH_ROWS):
+            yield from zip(*(column.to_pylist() for column in batch.columns), strict=True)
+
+    def found(self, make: Callable[[Manifest], T]) -> T:
+        """Return what `make` says of the records, as long as they are the same."""
+        if make not in self._found:
+            self._found[make] = make(self)
+        return cast("T", self._found[make])
 
     def without_file(self, product: str) -> set[str]:
         """Return the units of a product that are finished and have no file."""
@@ -115,6 +141,23 @@ class Manifest:
         if record.key != key:
             return DAMAGED if record.key == _DAMAGED else CHANGED
         return DAMAGED if record.path and self._store.size(record.path) != record.bytes else ""
+
+    def reasons(self, product: str, units: Sequence[str], keys: Sequence[str]) -> dict[str, str]:
+        """Return why outputs are due (:meth:`why_due`), by unit, without those that are current: of many at once."""
+        own = self._own(product)
+        at = pc.index_in(pa.array(units, pa.string()), own.column("unit"))
+        known = own.select(["key", "path", "bytes"]).take(at)
+        same = pc.fill_null(pc.equal(known.column("key"), pa.array(keys, pa.string())), False)
+        paths = [path or "" for path in known.column("path").to_pylist()]
+        sizes = iter(self._store.sizes([path for path in paths if path]))
+        held = pa.array([next(sizes) if path else None for path in paths], pa.int64())
+        whole = pc.or_kleene(pc.equal(pa.array(paths), ""), pc.fill_null(pc.equal(held, known.column("bytes")), False))
+        odd = np.flatnonzero(~(same.to_numpy() & pc.fill_null(whole, False).to_numpy()))
+        stored, is_same = known.column("key").take(pa.array(odd)).to_pylist(), same.to_numpy()[odd].tolist()
+        return {
+            units[place]: MISSING if key is None else DAMAGED if fits or key == _DAMAGED else CHANGED
+            for place, key, fits in zip(odd.tolist(), stored, is_same, strict=True)
+        }
 
     def add(self, records: Iterable[OutputRecord]) -> None:
         """Record finished outputs durably. :meth:`settle` removes files under older names."""
@@ -188,16 +231,26 @@ class Manifest:
         """Return the rows of a product by unit."""
         rows = self._rows.get(product)
         if rows is None:
-            table = self.table()
-            own = rows_of(table.filter(pc.equal(table.column("product"), product)))
-            rows = self._rows[product] = {row[1]: row for row in own}
+            rows = self._rows[product] = {row[1]: row for row in rows_of(self._own(product))}
         return rows
+
+    def _own(self, product: str) -> pa.Table:
+        """Return the records of a product, which stand together."""
+        table = self.table()
+        if not self._places:
+            counts = table.column("product").value_counts().to_pylist()
+            ends = itertools.accumulate(one["counts"] for one in counts)
+            self._places = {
+                one["values"]: (end - one["counts"], one["counts"]) for one, end in zip(counts, ends, strict=True)
+            }
+        return table.slice(*self._places.get(product, (0, 0)))
 
     def table(self) -> pa.Table:
         """Return every record, by product and unit."""
         if self._behind:
             news, self._behind = list(map(self._read, self._behind)), []
             self._table, moved = latest(pa.concat_tables([self._table, *news]))
+            self._places.clear()
             self._moved += moved
         return self._table
 
@@ -207,6 +260,7 @@ class Manifest:
         self._append(Packed.of(table_of([(product, unit, "", "", 0, "", "") for product, unit in outputs])))
 
     def _append(self, records: Packed) -> None:
+        self._found.clear()
         self._behind.append(self._write(records, keep=True))
         if len(self._parts) > _MOST_PARTS:
             self._merge()

@@ -32,17 +32,31 @@ def repair_records(store: Store, report: Report = lambda _: None) -> None:
 
 def fault_of(store: Store, folder: Path, path: str, size: int, digest: str) -> str | None:
     """Return what is wrong with a recorded file, None for nothing. `folder` is for copies of remote files."""
+    if (fault := size_fault(store, path, size)) is not None:
+        return fault
+    try:
+        with store.copied(path, folder) as local:
+            return digest_fault(local, path, digest)
+    except OSError as error:
+        return unread_fault(path, error)
+
+
+def size_fault(store: Store, path: str, size: int) -> str | None:
+    """Return what is wrong with a recorded file by its size alone."""
     found = store.size(path)
     if found is None:
         return f"{path}: missing"
-    if found != size:
-        return f"{path}: {found} bytes, expected {size}"
-    try:
-        if digest_holds(store.local_copy(path, folder), digest):
-            return None
-    except OSError as error:
-        return f"{path}: it cannot be read: {error.strerror or error}"
-    return f"{path}: the content has changed (digest differs)"
+    return None if found == size else f"{path}: {found} bytes, expected {size}"
+
+
+def digest_fault(local: Path, path: str, digest: str) -> str | None:
+    """Return what is wrong with a recorded file, of which `local` is a copy, by its content."""
+    return None if digest_holds(local, digest) else f"{path}: the content has changed (digest differs)"
+
+
+def unread_fault(path: str, error: OSError) -> str:
+    """Return that a file cannot be read, and why."""
+    return f"{path}: it cannot be read: {error.strerror or error}"
 
 
 def _mend_logs(store: Store, report: Report) -> None:

@@ -84,7 +84,7 @@ def salvaged(
     gone = [number for number, group in enumerate(groups) if group is None]
     sound = [group for group in groups if group is not None]
     if not sound:
-        return None, file.rows, file.group_spans
+        return None, file.rows, tuple(file.group_spans)
     rows = pa.concat_tables(sound)
     schema = stored_schema(table, rows.schema.names)
     if not schema.holds:
@@ -139,7 +139,16 @@ def read_lost(store: Store) -> list[Lost]:
 def write_lost(store: Store, lost: Sequence[Lost]) -> None:
     """Replace the list."""
     if lost or store.exists(_LOST):
-        store.write_bytes(_LOST, checked_json({"lost": [dataclasses.asdict(one) for one in lost]}))
+        store.write_bytes(_LOST, checked_json({"lost": list(map(_values, lost))}))
+
+
+def _values(one: Lost) -> dict[str, Any]:
+    """Return what :func:`_parsed` reads."""
+    spans = [list(span) for span in one.spans]
+    return {f.name: getattr(one, f.name) for f in dataclasses.fields(one)} | {
+        "file": one.file.as_json(),
+        "spans": spans,
+    }
 
 
 def _parsed(raw: dict[str, Any]) -> Lost:

@@ -24,7 +24,8 @@ def stamp_of(store: Store, path: str) -> Stamp | None:
     try:
         if store.is_folder:
             return stamp_of_stat(os.stat(store.path(path)))  # noqa: PTH116 — thousands of them
-        return stamp_of_info(store.fs.info(store.path(path)))
+        known = store.state(path)
+        return stamp_of_info(store.fs.info(store.path(path))) if known is None else Stamp(*known)
     except (FileNotFoundError, NotADirectoryError):
         return None
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import io
 import os
 import shutil
 import tempfile
@@ -54,6 +55,11 @@ write blocks of some megabytes."""
 _MAKE_ROOM: Final = (
     "see to more room, and run again: what is finished stays, and the next run goes on where this one stopped"
 )
+
+_AT_ONCE_BYTES: Final = 16 << 20
+"""Largest object (bytes) that is copied by one request and through memory."""
+_MANY_FILES: Final = 64
+"""Files whose folders are listed, where fewer are asked for one by one: a folder may hold many others."""
 
 MADE_AGAIN: Final = "run `roadscan verify`, which finds all such files; the next run then makes them again"
 """How a damaged product is repaired."""
@@ -123,6 +129,19 @@ class Store:
         except FileNotFoundError:
             return None
 
+    def sizes(self, paths: Sequence[str]) -> list[int | None]:
+        """Return the bytes of some files, None for each that is missing; folders with many of them are listed once."""
+        if not self.is_folder or len(paths) < _MANY_FILES:
+            return list(map(self.size, paths))
+        places = [path.rpartition("/") for path in paths]
+        held = {folder: self._sizes_in(folder) for folder in {folder for folder, _, _ in places}}
+        return [held[folder].get(name) for folder, _, name in places]
+
+    def _sizes_in(self, folder: str) -> dict[str, int]:
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(self.path(folder)) as entries:
+            return {one.name: one.stat().st_size for one in entries}
+        return {}
+
     def files(self, relative: str, suffix: str = "") -> list[str]:
         """Return the files below a folder, relative to the root, sorted."""
         if (look := self._look()) is not None:
@@ -135,6 +154,10 @@ class Store:
         found = self.fs.find(self.path(relative))
         start = len(self.fs._strip_protocol(self.root)) + 1
         return sorted(f[start:] for f in found if f.endswith(suffix))
+
+    def state(self, relative: str) -> tuple[int, str] | None:
+        """Return bytes and ETag of an object, None where only the store can tell."""
+        return None if (look := self._look()) is None else look.state(relative)
 
     def changed_s(self, relative: str) -> float:
         """Return when a file was written (Unix s), by the store's clock."""
@@ -164,6 +187,14 @@ class Store:
         if look is not None:
             look.keep(relative, content)
         return content
+
+    def opened(self, relative: str) -> Any:
+        """Return a file as a stream of bytes; an object whose size is known to be small comes by one request."""
+        look = self._look()
+        size = None if look is None else look.size(relative)
+        if size is not None and size <= _AT_ONCE_BYTES:
+            return io.BytesIO(self.read_bytes(relative))
+        return self.fs.open(self.path(relative), "rb")
 
     def read_table(self, relative: str, columns: Sequence[str] | None = None, change: str = MADE_AGAIN) -> pa.Table:
         """Return a small Parquet file, its seal and its page checksums verified; `change` says how to repair it.
@@ -313,9 +344,22 @@ class Store:
         """Return the path of a local file with the content of a stored one (itself, where the store is a folder)."""
         if self.is_folder:
             return Path(self.path(relative))
-        target = folder / Path(relative).name
-        self.fs.get_file(self.path(relative), str(target))
+        target, size = folder / Path(relative).name, self.size(relative)
+        if size is None or size > _AT_ONCE_BYTES:
+            self.fs.get_file(self.path(relative), str(target))
+        else:
+            target.write_bytes(self.fs.cat_file(self.path(relative), **at_once(self.fs)))
         return target
+
+    @contextlib.contextmanager
+    def copied(self, relative: str, folder: Path) -> Iterator[Path]:
+        """Return the same; a copy is removed afterwards."""
+        local = self.local_copy(relative, folder)
+        try:
+            yield local
+        finally:
+            if not self.is_folder:
+                local.unlink(missing_ok=True)
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
@@ -336,7 +380,7 @@ class Store:
             self._lease = lease
             if self.is_folder:
                 self._clear_staging()
-            with self.looked():
+            with self.looked(anew=True):  # somebody else may have written before
                 self.check_version()
                 yield
         finally:
@@ -370,11 +414,14 @@ class Store:
         return FolderPlace(Path(file), self._new_temporary, alone_in) if self.is_folder else ObjectPlace(self.fs, file)
 
     @contextlib.contextmanager
-    def looked(self) -> Iterator[None]:
-        """Ask an object store for nothing twice, as long as nobody else writes to it (a folder is asked each time)."""
+    def looked(self, *, anew: bool = False) -> Iterator[None]:
+        """Ask an object store for nothing twice, as long as nobody else writes to it (a folder is asked each time).
+
+        What is known already holds, unless it is asked for `anew`.
+        """
         with contextlib.ExitStack() as stack:
             if not self.is_folder:
-                stack.enter_context(looking((self.url, self.survey_id), self.fs, self.root))
+                stack.enter_context(looking((self.url, self.survey_id), self.fs, self.root, anew=anew))
             yield
 
     def told(self, written: Iterable[tuple[str, int]]) -> None:

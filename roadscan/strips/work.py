@@ -182,6 +182,8 @@ def _way(recorded: Trajectory, ground: MapSettings, span: tuple[int, int]) -> Wa
 
 def _within(one: RawSlice, file: DataFile, span: tuple[int, int]) -> RawSlice | None:
     """Returns the row groups of a data file with readings of a time span; None if there are none."""
+    if not any(first <= span[1] and last >= span[0] for first, last in one.spans):
+        return None
     own = one.source.spans(file.group_spans)
     near = [g for g, (first, last) in enumerate(own) if first <= span[1] and last >= span[0]]
     return RawSlice(one.source, one.file, near, tuple(own[g] for g in near), 0) if near else None

@@ -5,26 +5,27 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import pyarrow.parquet as pq
 
 from roadscan.core.errors import DamagedError, RoadscanError, StoreError
 from roadscan.core.witness import Finding
-from roadscan.footprints.footprints import PRODUCT
+from roadscan.footprints.footprints import JOINED, PRODUCT
 from roadscan.georeference.plan.plan import NothingToPlaceError
-from roadscan.georeference.reading_counts import reading_counts
+from roadscan.georeference.reading_counts import LogCounts
 from roadscan.ingest.overlap import NothingPlacedError
 from roadscan.ingest.planned_logs import PlannedLog, UnplannedLog, logs_of
 from roadscan.ingest.sources import damaged_sources
 from roadscan.navigation.tasks.navigate import known_keys
+from roadscan.run.engine.compute import rare_collections
 from roadscan.run.session import Session
 from roadscan.run.stage import StageState, findings_of, stages
 from roadscan.store.damage import UNREADABLE
 from roadscan.store.history import history_faults
 from roadscan.store.logs import LogRecord, copy_path, has_log, read_log_records, record_path
 from roadscan.store.manifest import Manifest, OutputRecord, read_failures
-from roadscan.store.repair_records import fault_of
+from roadscan.store.repair_records import digest_fault, fault_of, size_fault, unread_fault
 from roadscan.store.salvage import Lost, read_lost
 from roadscan.store.stamp import Stamp, stamp_of
 from roadscan.store.store import Store
@@ -33,7 +34,10 @@ from roadscan.store.written_by import VERSION_FILE
 from roadscan.survey.forgotten import forgotten_pictures
 from roadscan.survey.preflight import preflight
 from roadscan.tiles.product import products
-from roadscan.tiles.tasks.tile_plan import TILE
+from roadscan.tiles.tasks.tile_figures import tile_figures
+
+_UNSHOWN: Final = (PRODUCT, JOINED)
+"""Products that are no file that somebody asked for."""
 
 
 @dataclass
@@ -118,12 +122,13 @@ class Status:
 
 def survey_status(session: Session) -> Status:
     """Return the state of a survey from its manifest; no readings are read."""
-    with session.store.looked():
+    with session.store.looked(), rare_collections():
         return _survey_status(session)
 
 
 def _survey_status(session: Session) -> Status:
     store, damaged = session.store, session.hear_of_damage()
+    records = {r.key: r for r in read_log_records(store, damaged=damaged)}  # held from here on, not read again
     found = preflight(session.survey, store)
     causes = [*map(str, found.causes), *found.failing]
     status = Status(failures=read_failures(store), would_fail=causes.copy(), checked=list(found.notes))
@@ -131,18 +136,17 @@ def _survey_status(session: Session) -> Status:
     unsaid = [u for u in unplanned if not causes]  # otherwise reported there, once per cause
     status.failures += [{"stage": "ingest", "unit": u.path, "reason": str(u.error)} for u in unsaid]
     manifest = session.manifest
-    records = {r.key: r for r in read_log_records(store, damaged=damaged)}
     status.damaged = list(map(str, damaged))
     status.lost = read_lost(store)
     status.logs = [_log_state(store, log, records.get(log.key)) for log in planned]
     status.logs += [_unplanned_state(one) for one in unplanned]
     keys = {*(log.key for log in planned), *known_keys(session.survey, store, logs_of(session))}
     status.unused_logs = [f"{r.run}/{r.sensor} {r.path}" for r in records.values() if r.key not in keys]
-    status.outputs = {product: count for product, count in manifest.files().items() if product != PRODUCT}
+    status.outputs = {product: count for product, count in manifest.files().items() if product not in _UNSHOWN}
     files = (one for r in records.values() if r.key in keys for one in r.tables.items())
     for table, own in files:
         status.ingested[table] = status.ingested.get(table, 0) + len(own)
-    status.readings = reading_counts([*manifest.of(PRODUCT).values(), *manifest.of(TILE).values()])
+    status.readings = (LogCounts(manifest.of(PRODUCT).values()) + tile_figures(manifest).counts).of_all()
     status.findings = findings_of(session.survey, [r for r in records.values() if r.key in keys], manifest)
     for stage in stages():
         try:
@@ -276,10 +280,17 @@ def _copy_faults(store: Store, keys: Sequence[str]) -> list[str]:
 
 
 def _check_output(store: Store, folder: Path, record: OutputRecord) -> str | None:
-    fault = fault_of(store, folder, record.path, record.bytes, record.digest)
-    if fault is not None:
+    if (fault := size_fault(store, record.path, record.bytes)) is not None:
         return fault
-    local = store.local_copy(record.path, folder)
+    try:
+        with store.copied(record.path, folder) as local:
+            return digest_fault(local, record.path, record.digest) or _unopened(local, record)
+    except OSError as error:
+        return unread_fault(record.path, error)
+
+
+def _unopened(local: Path, record: OutputRecord) -> str | None:
+    """Return why an output's file, of which `local` is a copy, is not what it should be."""
     try:
         if record.product in products():
             products()[record.product].check(local)

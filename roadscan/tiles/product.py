@@ -78,7 +78,7 @@ class Tile:
         return pyramid_of(self.cells, overview_factors(self.cells.cells_per_edge))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class TileSummary:
     """One row of ``schemas/tiles.toml``, without the outline."""
 

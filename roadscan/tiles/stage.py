@@ -10,7 +10,7 @@ from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
 from roadscan.footprints.footprints import PRODUCT as FOOTPRINTS
 from roadscan.footprints.stage import faults_of_plan
-from roadscan.georeference.reading_counts import counts_by_log, fate_words, lost_findings, of_all
+from roadscan.georeference.reading_counts import LogCounts, counts_by_log, fate_words, lost_findings, of_all
 from roadscan.run.engine.compute import LazyTasks
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState, check_stages_ahead
@@ -18,6 +18,7 @@ from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import Manifest
 from roadscan.tiles.product import TileProduct
 from roadscan.tiles.tasks.passes_apart import apart_findings
+from roadscan.tiles.tasks.tile_figures import tile_figures
 from roadscan.tiles.tasks.tile_files import tile_file_names
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, TileTask
 from roadscan.tiles.tasks.tile_work import memory_of, plan_tile_work
@@ -88,7 +89,8 @@ class Tiles(Stage):
         work = plan_tile_work(session)
         tasks = list(work.planned.tasks(work.chosen, session.compute.workers))
         stale = {str(tile) for t in tasks for tile in t.block.tiles}
-        current = sum(1 for r in session.manifest.of(TILE).values() if r.path and r.unit not in stale)
+        held = session.manifest.column(TILE, "unit", "path")
+        current = sum(1 for unit, path in held if path and unit not in stale)
         return StageState(
             current,
             len(stale),
@@ -102,9 +104,9 @@ class Tiles(Stage):
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
         """Return logs of which many readings have no pose, and passes that lie at different heights."""
-        tiles = list(manifest.of(TILE).values())
-        logs = counts_by_log([*manifest.of(FOOTPRINTS).values(), *tiles])
-        return [*lost_findings(logs, records, survey.config.checks.lost_share), *apart_findings(tiles)]
+        found = tile_figures(manifest)
+        logs = (LogCounts(manifest.of(FOOTPRINTS).values()) + found.counts).by_log()
+        return [*lost_findings(logs, records, survey.config.checks.lost_share), *apart_findings(found.apart)]
 
     def folders(self) -> Sequence[str]:
         """Return the folders of tile files, those of surfaces included."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from roadscan.core.errors import StoreError
 from roadscan.core.survey import Survey
-from roadscan.footprints.footprints import FootprintRanges, load_ranges
+from roadscan.footprints.footprints import PRODUCT, FootprintRanges, join_footprints, load_ranges
 from roadscan.footprints.reach import opened, touched_tiles
 from roadscan.georeference.place import Window
 from roadscan.georeference.plan.plan import SurveyPlan, plan_survey
@@ -114,3 +115,22 @@ def test_a_survey_without_footprints_says_so(indexed, tmp_path: Path) -> None:
     plan, _ = indexed
     with pytest.raises(StoreError, match="no footprints"):
         load_ranges(plan, Manifest(Store(str(tmp_path), "new")))
+
+
+def test_footprints_of_all_come_from_one_file(indexed, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It holds what the files of all data files hold, and is left aside where one of them is another now."""
+    plan, manifest = indexed
+    join_footprints(plan, manifest)
+    singly = load_ranges(plan, manifest, files={f.path for _, files in plan.sources for f in files})
+    read, opened = Store.read_bytes, list[str]()
+    monkeypatch.setattr(Store, "read_bytes", lambda store, path: opened.append(path) or read(store, path))
+    whole = load_ranges(plan, manifest)
+    assert opened == ["manifest/footprints.parquet"]
+    assert pairs_of(whole).tolist() == pairs_of(singly).tolist()
+    assert whole.readings.tolist() == singly.readings.tolist()
+    other = copy.copy(manifest)
+    first = next(iter(manifest.of(PRODUCT).values()))
+    other._rows = {**manifest._rows, PRODUCT: {**manifest._rows[PRODUCT], first.unit: (*first._replace(digest=""),)}}
+    opened.clear()
+    load_ranges(plan, other)
+    assert len(opened) == len(whole.slices) and "manifest/footprints.parquet" not in opened

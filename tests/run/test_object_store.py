@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
@@ -129,7 +130,11 @@ def test_an_idle_run_lists_s3_once(finished: Simulated) -> None:
         with store.looked():
             assert run(survey, store).raw_bytes_read == 0
         assert not any("HEAD" in method and "tiles" in path for method, path in objects.requests)
-        assert len(objects.requests) <= 60 < len(held)
+        assert len(objects.requests) <= 40 < len(held)
+        objects.requests.clear()
+        assert verify_store(store) == []
+        of_files = Counter(path for _, path in objects.requests if "/tiles/" in path or "/tables/" in path)
+        assert len(of_files) > 40 and set(of_files.values()) == {1}
 
 
 def test_what_a_worker_wrote_is_seen(objects: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,12 @@ def keys_of(common: str, content: npt.NDArray[np.void], ends: npt.NDArray[np.int
         found.append(one.hexdigest())
         start = end
     return found
+
+
+def keys_beside(keys: Sequence[str], other: str) -> list[str]:
+    """Return ``key_of(key, other)`` for each of many keys, which are hexadecimal digits."""
+    end = f'",{json.dumps(other)}]'
+    return [hashlib.blake2b(f'["{key}{end}'.encode(), digest_size=8).hexdigest() for key in keys]
 
 
 def grid_key(geoid: Geoid | None) -> list[str] | None:

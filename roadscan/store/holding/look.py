@@ -43,6 +43,11 @@ class Look:
         """Return the bytes of a file, None where it is not known."""
         return self._listed().get(path)
 
+    def state(self, path: str) -> tuple[int, str] | None:
+        """Return bytes and ETag of a file that is as it was listed, None where only the store can tell."""
+        size, state = self._listed().get(path), self._states.get(path)
+        return None if size is None or state is None else (size, state)
+
     def exists(self, path: str) -> bool | None:
         """Return True if the file or folder exists; None where only the store can tell."""
         if path in self._listed() or path in self._folders:
@@ -140,10 +145,11 @@ _LOOKS: Final[dict[tuple[str, str], Look]] = {}
 
 
 @contextlib.contextmanager
-def looking(key: tuple[str, str], fs: Any, root: str) -> Iterator[None]:
-    """Remember what an object store holds, from now on and anew."""
+def looking(key: tuple[str, str], fs: Any, root: str, *, anew: bool = False) -> Iterator[None]:
+    """Remember what an object store holds, from now on, or go on with what is remembered; `anew` lists it again."""
     is_inner = key in _LOOKS
-    _LOOKS[key] = Look(fs, root, _LOOKS.get(key))
+    if anew or not is_inner:
+        _LOOKS[key] = Look(fs, root, _LOOKS.get(key))
     try:
         yield
     finally:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,8 +27,8 @@ from roadscan.tiles.product import (
 )
 from roadscan.tiles.pyramid import Level, pyramid_of
 from roadscan.tiles.tasks.cell_files import read_cells, read_overview
+from roadscan.tiles.tasks.tile_figures import TileFigures, tile_figures
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE
-from roadscan.tiles.tasks.tiles import summary_of
 from roadscan.tiles.tasks.wanted_products import product_context, product_key, wanted_products
 
 _TILES_DRAWN = 2000
@@ -62,38 +62,42 @@ class OutputTask:
         return f"products/{self.product.name}/{self.output.name}"
 
 
+@dataclass(frozen=True)
+class PlannedOutput:
+    """One file of a survey product that there should be."""
+
+    product: SurveyProduct
+    options: Strict
+    output: Output
+    key: str
+    read: tuple[OutputRecord, ...]
+    """Records of the files of surface products from which it is made."""
+
+    @property
+    def unit(self) -> tuple[str, str, str]:
+        """Its product, name and key, as the manifest knows it."""
+        return self.product.name, self.output.name, self.key
+
+
 def plan_outputs(plan: SurveyPlan, manifest: Manifest) -> tuple[list[OutputTask], list[OutputRecord]]:
     """Files of survey products that are missing or stale, and records of those no longer due."""
     due, gone = wanted_outputs(plan, manifest)
-    return [t for t in due if not manifest.is_current(t.product.name, t.output.name, t.key)], gone
+    stale = [one for one in due if not manifest.is_current(*one.unit)]
+    return _tasks(stale, plan, manifest), gone
 
 
-def wanted_outputs(plan: SurveyPlan, manifest: Manifest) -> tuple[list[OutputTask], list[OutputRecord]]:
+def wanted_outputs(plan: SurveyPlan, manifest: Manifest) -> tuple[list[PlannedOutput], list[OutputRecord]]:
     """Files of survey products that there should be of the tiles that there are, and records of others."""
     context = product_context(plan)
-    records = sorted((r for r in manifest.of(TILE).values() if r.path), key=lambda r: TileId.parse(r.unit))
-    keys = {r.unit: r.key for r in records}
-    overviews = {unit: r for unit, r in manifest.of(OVERVIEWS).items() if r.path and keys.get(unit) == r.key}
-    by_tile = {TileId.parse(r.unit): r for r in records}
-    summaries = {s.tile: s for s in map(summary_of, records) if s is not None}
-    tasks = [
-        task
+    planned = [
+        one
         for product, options in wanted_products(plan.survey)
         if isinstance(product, SurveyProduct)
-        for task in _tasks(
-            product,
-            options,
-            plan,
-            context,
-            by_tile,
-            overviews,
-            summaries,
-            [r for name in product.reads for r in manifest.of(name).values()],
-        )
+        for one in _planned(product, options, plan, context, manifest)
     ]
-    due = {(t.product.name, t.output.name) for t in tasks}
+    due = {(one.product.name, one.output.name) for one in planned}
     kinds = {name for name, p in products().items() if isinstance(p, SurveyProduct)}
-    return tasks, [r for r in manifest.beside(kinds, ()) if (r.product, r.unit) not in due]
+    return planned, [r for r in manifest.beside(kinds, ()) if (r.product, r.unit) not in due]
 
 
 def make_products(
@@ -166,40 +170,50 @@ class StoredTiles:
         return None if cells is None else pyramid_of(cells, (factor,))[0]
 
 
-def _tasks(
-    product: SurveyProduct,
-    options: Strict,
-    plan: SurveyPlan,
-    context: ProductContext,
-    by_tile: Mapping[TileId, OutputRecord],
-    overviews: Mapping[str, OutputRecord],
-    summaries: Mapping[TileId, TileSummary],
-    files: Sequence[OutputRecord],
-) -> list[OutputTask]:
-    tasks: list[OutputTask] = []
-    drives = Drives.of(plan) if product.needs_lanes else None
+def _planned(
+    product: SurveyProduct, options: Strict, plan: SurveyPlan, context: ProductContext, manifest: Manifest
+) -> Iterator[PlannedOutput]:
+    found = tile_figures(manifest)
+    files = [r for name in product.reads for r in manifest.of(name).values()]
+    driven = [Drives.of(plan).key()] if product.needs_lanes else []
     own_key = product_key(product, options, context)
-    driven = [] if drives is None else [drives.key()]
-    bridged = {TileId.parse(r.unit) for r in files} - summaries.keys()  # tiles with a surface and no reading
-    known = [*summaries.values(), *map(TileSummary.without_readings, sorted(bridged))]
-    for output in product.outputs(known, options, context) if summaries else []:
-        own = tuple(by_tile[t] for t in output.tiles if t in by_tile)
+    bridged = {TileId.parse(r.unit) for r in files} - found.summaries.keys()  # tiles with a surface and no reading
+    known = [*_in_order(found), *map(TileSummary.without_readings, sorted(bridged))]
+    for output in product.outputs(known, options, context) if found.summaries else []:
         read = _read(product, files, output)
-        parts = [(r.unit, r.digest, r.detail) for r in (*own, *read)]
-        key = key_of(own_key, output.name, parts, *driven)
+        parts = [(r.unit, r.digest, r.detail) for r in read]
+        tiles = [found.contents[tile] for tile in output.tiles if tile in found.contents]
+        yield PlannedOutput(product, options, output, key_of(own_key, output.name, tiles, parts, *driven), read)
+
+
+def _in_order(found: TileFigures) -> list[TileSummary]:
+    return [found.summaries[tile] for tile in sorted(found.summaries)]
+
+
+def _tasks(due: Sequence[PlannedOutput], plan: SurveyPlan, manifest: Manifest) -> list[OutputTask]:
+    """Return the tasks of some files, with the records of their tiles."""
+    context, found = product_context(plan), tile_figures(manifest)
+    drives = Drives.of(plan) if any(one.product.needs_lanes for one in due) else None
+    units = {str(tile) for one in due for tile in one.output.tiles}
+    cells = {TileId.parse(r.unit): r for r in manifest.chosen(TILE, units) if r.path}
+    keys = {r.unit: r.key for r in cells.values()}
+    overviews = {r.unit: r for r in manifest.chosen(OVERVIEWS, units) if r.path and keys.get(r.unit) == r.key}
+    tasks: list[OutputTask] = []
+    for one in due:
+        own = tuple(cells[tile] for tile in one.output.tiles if tile in cells)
         tasks.append(
             OutputTask(
                 plan.store,
-                product,
-                options,
+                one.product,
+                one.options,
                 context,
-                output,
-                key,
-                tuple(summaries[t] for t in sorted(output.tiles) if t in summaries),
+                one.output,
+                one.key,
+                tuple(found.summaries[t] for t in sorted(one.output.tiles) if t in found.summaries),
                 own,
                 tuple(overviews[r.unit] for r in own if r.unit in overviews),
-                read,
-                drives,
+                one.read,
+                drives if one.product.needs_lanes else None,
             )
         )
     return tasks

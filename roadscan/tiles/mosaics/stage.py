@@ -32,7 +32,7 @@ class Products(Stage):
     def state(self, session: Session) -> StageState:
         """Files that are missing or stale."""
         wanted, _ = wanted_outputs(plan_of(session), session.manifest)
-        state = StageState.of(session.manifest, [(t.product.name, t.output.name, t.key) for t in wanted])
+        state = StageState.of(session.manifest, [one.unit for one in wanted])
         state.notes = density_notes(session.survey, session.store, session.manifest)
         return state
 

@@ -8,7 +8,7 @@ counted and not modelled; no reading is read again.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -18,10 +18,12 @@ import numpy.typing as npt
 from roadscan.core.errors import RoadscanError
 from roadscan.core.grid import ENOUGH, LARGEST_M, TileGrid
 from roadscan.core.survey import Survey
-from roadscan.store.manifest import Manifest, OutputRecord
+from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
 from roadscan.tiles.cells import TileCells
+from roadscan.tiles.product import TileSummary
 from roadscan.tiles.tasks.cell_files import read_cells
+from roadscan.tiles.tasks.tile_figures import tile_figures
 from roadscan.tiles.tasks.tile_plan import TILE
 
 _SAMPLED: Final = 4
@@ -72,24 +74,23 @@ def _readings(number: float) -> str:
 
 def _density(grid: TileGrid, store: Store, manifest: Manifest) -> CellDensity | None:
     """Return the density of the fullest tiles; None where there are none, or cells have plenty."""
-    chosen = _fullest([r for r in manifest.of(TILE).values() if r.path])
-    figures = [record.figures() for record in chosen]
-    if not chosen or sum(f["points"] for f in figures) >= _PLENTY * sum(f["cells"] for f in figures):
+    chosen = _fullest(tile_figures(manifest).summaries.values())
+    if not chosen or sum(one.points for one in chosen) >= _PLENTY * sum(one.cells for one in chosen):
         return None
-    tiles = [read_cells(store, record, grid.cells_per_edge) for record in chosen]
+    records = {record.unit: record for record in manifest.chosen(TILE, [str(one.tile) for one in chosen])}
+    tiles = [read_cells(store, records[str(one.tile)], grid.cells_per_edge) for one in chosen]
     return cell_density(tiles, grid)
 
 
-def _fullest(records: Sequence[OutputRecord]) -> list[OutputRecord]:
+def _fullest(tiles: Iterable[TileSummary]) -> list[TileSummary]:
     """Return some of the tiles that together have half of all readings, from the fullest to the least full."""
-    points = [(int(r.figures().get("points", 0)), r) for r in records]
-    ordered = sorted((one for one in points if one[0]), key=lambda one: (-one[0], one[1].unit))
+    ordered = sorted(tiles, key=lambda one: (-one.points, str(one.tile)))
     if not ordered:
         return []
-    held = np.cumsum([number for number, _ in ordered])
+    held = np.cumsum([one.points for one in ordered])
     half = ordered[: int(np.searchsorted(held, held[-1] / 2)) + 1]
     numbers = np.unique(np.linspace(0, len(half) - 1, _SAMPLED).round().astype(int))
-    return [half[k][1] for k in numbers.tolist()]
+    return [half[k] for k in numbers.tolist()]
 
 
 def cell_density(tiles: Sequence[TileCells], grid: TileGrid) -> CellDensity:

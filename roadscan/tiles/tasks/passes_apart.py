@@ -13,7 +13,6 @@ from roadscan.core.grid import QUANTUM_M, TileGrid
 from roadscan.core.ids import LanePass
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.cloud import TilePoints
-from roadscan.store.records import OutputRecord
 
 PASSES_APART: Final = Witness(
     "passes_apart",
@@ -68,12 +67,11 @@ def apart_in_tile(points: TilePoints, grid: TileGrid, passes: Sequence[LanePass]
     return found
 
 
-def apart_findings(tiles: Iterable[OutputRecord]) -> list[Finding]:
-    """Return passes that differ by far more than their noise, from the records of tiles; the largest first."""
+def apart_findings(told: Iterable[tuple[str, str, int, float, float]]) -> list[Finding]:
+    """Return passes that differ by far more than their noise, from the figures of all tiles; the largest first."""
     pairs: dict[tuple[str, str], list[tuple[int, float, float]]] = defaultdict(list)
-    for record in tiles:
-        for one, other, *figures in record.figures().get(FIGURE, ()):
-            pairs[one, other].append(tuple(figures))
+    for one, other, count, away_m, spread_m in told:
+        pairs[one, other].append((count, away_m, spread_m))
     found: list[tuple[float, Finding]] = []
     for (one, other), figures in pairs.items():
         cells, off_m, scatter_m = np.array(figures).T

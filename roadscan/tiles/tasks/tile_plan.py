@@ -20,7 +20,7 @@ from roadscan.georeference.plan.plan import SurveyPlan, plan_of
 from roadscan.georeference.plan.road import road_key
 from roadscan.georeference.sources import MapSettings, RawSlice
 from roadscan.run.engine.compute import LazyTasks
-from roadscan.run.engine.fingerprint import key_of, keys_of
+from roadscan.run.engine.fingerprint import key_of, keys_beside, keys_of
 from roadscan.run.session import Session, found_once
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
@@ -188,9 +188,16 @@ def _correction_digests(f: FootprintRanges, plan: SurveyPlan) -> npt.NDArray[np.
 
 def stale_tiles(tiles: PlannedTiles, products: Sequence[WantedProduct], manifest: Manifest) -> dict[TileId, str]:
     """Tiles that are missing, changed, or lack a wanted product, each with the reason."""
-    pairs = zip(tiles.ids, tiles.keys, strict=True)
-    reasons = ((tile, _why_due(str(tile), key, products, manifest)) for tile, key in pairs)
-    return {tile: why for tile, why in reasons if why}
+    units = list(map(str, tiles.ids))
+    found = manifest.reasons(TILE, units, tiles.keys)
+    bare = found.keys() | manifest.without_file(TILE)  # without points, and so without files
+    kept = [(unit, key) for unit, key in zip(units, tiles.keys, strict=True) if unit not in bare]
+    own, keys = [unit for unit, _ in kept], [key for _, key in kept]
+    wanted = [(name, keys_beside(keys, one.key)) for one in products for name in one.files]
+    for name, theirs in [(OVERVIEWS, keys), *wanted]:
+        for unit, why in manifest.reasons(name, own, theirs).items():
+            found.setdefault(unit, f"{name} {why}")
+    return {tile: found[unit] for tile, unit in zip(tiles.ids, units, strict=True) if unit in found} if found else {}
 
 
 @dataclass(frozen=True)
@@ -260,17 +267,6 @@ class TilePlan:
             context=self.context,
             cell_table=self.plan.survey.config.tiles.cell_table,
         )
-
-
-def _why_due(unit: str, key: str, products: Sequence[WantedProduct], manifest: Manifest) -> str:
-    """Why a tile is due; empty where it is current, and where it is without points and so without files."""
-    record = manifest.get(TILE, unit)
-    why = manifest.why_due(TILE, unit, key)
-    if why or record is None or not record.path:
-        return why
-    files = ((name, key_of(key, wanted.key)) for wanted in products for name in wanted.files)
-    faults = ((name, manifest.why_due(name, unit, own)) for name, own in ((OVERVIEWS, key), *files))
-    return next((f"{name} {why}" for name, why in faults if why), "")
 
 
 @found_once

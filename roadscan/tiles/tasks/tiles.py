@@ -28,6 +28,7 @@ from roadscan.tiles.tasks.cell_files import write_cells, write_overviews
 from roadscan.tiles.tasks.passes_apart import FIGURE as PASSES_APART
 from roadscan.tiles.tasks.passes_apart import apart_in_tile
 from roadscan.tiles.tasks.tile_cells import count_tiles
+from roadscan.tiles.tasks.tile_figures import summary_in
 from roadscan.tiles.tasks.tile_files import publish_file, write_product
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, TileTask
 from roadscan.tiles.tasks.tile_points import load_tiles
@@ -158,13 +159,7 @@ def computed_tiles(task: TileTask, fates: ReadingCounts) -> Iterator[ComputedTil
 
 def summary_of(record: OutputRecord) -> TileSummary | None:
     """Return figures of a finished tile; None where it has no point."""
-    figures = record.figures()
-    if not figures.get("points"):
-        return None
-    figures["passes"] = tuple(figures["passes"])
-    for of_summary in ("fates", "overlapped_cells", PASSES_APART):
-        figures.pop(of_summary, None)
-    return TileSummary(tile=TileId.parse(record.unit), **figures)
+    return summary_in(TileId.parse(record.unit), record.figures())
 
 
 def _write_tile(task: TileTask, key: str, content: Tile, evidence: TileEvidence, folder: Path) -> list[OutputRecord]:

@@ -6,7 +6,7 @@ import json
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -310,6 +310,12 @@ def read_recorded(store: Store, record: OutputRecord) -> bytes:
     if record.digest and not bytes_hold(content, record.digest):
         raise DamagedError("the file is not as it was recorded", change=MADE_AGAIN, file=store.path(record.path))
     return content
+
+
+def recorded_rows(store: Store, records: Iterable[OutputRecord]) -> list[dict[str, Any]]:
+    """Return the rows of outputs that are Parquet files, each verified as by :func:`read_recorded`."""
+    held = (record for record in records if record.path)
+    return [row for r in held for row in store.parse_table(read_recorded(store, r), r.path).to_pylist()]
 
 
 def is_changing(store: Store) -> bool:

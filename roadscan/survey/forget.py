@@ -62,14 +62,16 @@ class Told:
 
 
 def choose_named(session: Session, names: Sequence[str]) -> list[Chosen]:
-    """Return pictures by their names RUN/CAMERA/FILE.
+    """Return pictures by their names RUN/CAMERA/FILE, also those that went: a command that was stopped is called again.
 
     Raises
     ------
     ConfigError
         where one is no picture of the survey, or a frame of a video.
     """
-    there = {one.name: one for log in _folders(session) for one in _pictures_of(log)}
+    logs = list(_folders(session))
+    there = {one.name: one for log in logs for one in _pictures_of(log)}
+    there = {one.name: one for one in _gone(session, logs)} | there
     chosen = []
     for name in dict.fromkeys(names):
         if name not in there:
@@ -129,16 +131,16 @@ def forget(session: Session, chosen: Collection[Chosen], why: str, archives: Seq
     for archive, files in opened:
         for path in set(paths.values()) | {one.path for one in known}:
             place = archive_place(path)
-            if place in files or archive.size(place) is not None:
-                archive.remove(place)
-                archived += 1
+            archived += archive.size(place) is not None
+            archive.remove(place)
             files.pop(place, None)
         archive.write_list(session.survey.config.id, files)
     removed = 0
     for one in chosen:
         try:
+            is_there = one.path.exists()
             one.path.unlink(missing_ok=True)
-            removed += 1
+            removed += is_there
         except OSError as error:
             left.append(f"{one.path}: {error.strerror}")
     return Told(removed, archived, tuple(left))
@@ -150,6 +152,15 @@ def _folders(session: Session) -> Iterator[PlannedLog]:
     if unplanned:
         raise RoadscanError(f"a log cannot be read: {unplanned[0].error}", change="put it right first")
     yield from (log for log in planned if log.format.name == _LOG and log.source.path.is_dir())
+
+
+def _gone(session: Session, logs: Sequence[PlannedLog]) -> Iterator[Chosen]:
+    """Yield pictures that were forgotten, of folders that are there."""
+    for one in forgotten_pictures(session.store):
+        path = session.survey.resolve(Path(one.path))
+        for log in logs:
+            if (log.run, log.sensor) == (one.run, one.camera) and path.is_relative_to(log.source.path):
+                yield Chosen(log.run, log.sensor, path.relative_to(log.source.path).as_posix(), log.source.path)
 
 
 def _pictures_of(log: PlannedLog) -> Iterator[Chosen]:

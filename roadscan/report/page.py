@@ -45,7 +45,7 @@ def _made(session: Session) -> tuple[str, list[str]]:
     config, failed = session.survey.config, list[str]()
     material = Material(session)
     parts = [part for part in (_part(section, material, failed) for section in sections()) if part.blocks]
-    failed += [f"what the map should show of {words}" for words in material.faults]
+    failed += [f"what is damaged: {words}" for words in material.faults]
     lead = (
         f"Report of the survey {config.id}. Lengths are in metres unless a unit is named; σ is one standard "
         "deviation; times are UTC."

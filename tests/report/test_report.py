@@ -188,7 +188,12 @@ def test_a_damaged_picture_is_named_in_its_place(finished: Simulated, tmp_path: 
     content = bytearray(store.read_bytes(path))
     content[len(content) // 2] ^= 1
     store.write_bytes(path, bytes(content))
-    assert f"{Path(path).name}: the file is not as it was recorded" in report_page(Session.open(copy.survey_file))
+    lines, session = Lines(), Session.open(copy.survey_file)
+    session.reporter = lines
+    store.remove(PATH)
+    keep_report(session)
+    assert f"{Path(path).name}: the file is not as it was recorded" in store.read_bytes(PATH).decode()
+    assert any(path in line for line in lines.lines), lines.lines  # nobody has to open the report to hear it
 
 
 def test_a_damaged_table_is_told_where_the_map_lacks_it(finished: Simulated, tmp_path: Path) -> None:
@@ -204,7 +209,7 @@ def test_a_damaged_table_is_told_where_the_map_lacks_it(finished: Simulated, tmp
     keep_report(session)
     told = "Not on the map: control: "
     assert told in store.read_bytes(PATH).decode()
-    assert any("the report lacks what the map should show of control: " in line for line in lines.lines), lines.lines
+    assert any("lacks what is damaged: not on the map: control: " in line for line in lines.lines), lines.lines
     store.write_bytes(path, whole)
     keep_report(Session.open(copy.survey_file))
     assert told not in store.read_bytes(PATH).decode()

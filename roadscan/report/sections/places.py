@@ -51,7 +51,7 @@ class Places(Section):
         yield Picture(whole, "The whole survey.", link="#views=map")
         layers, left_out = site_layers(site)
         for why in left_out:
-            material.faults.append(why)
+            material.faults.append(f"not on the map: {why}")
             yield Paragraph(f"Not on the map: {why}", is_warning=True)
         for layer in layers:
             if layer.group in _LAYERS:

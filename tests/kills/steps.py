@@ -8,7 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -32,6 +32,10 @@ ARCHIVE: Final = "{other}/archive"
 GONE: Final = ("manifest/outputs", "manifest/logs", "tables/footprints", "tiles", "products")
 """What is taken away from a finished store, for a run to make again."""
 PICTURES: Final = tuple(f"run-1/camera/{number:06d}.jpg" for number in (0, 1))
+_OFTEN: Final = 3.0
+"""Weight of a stage alone: it costs least."""
+_SELDOM: Final = 0.5
+"""Weight of a run that makes most of a store again: it costs most."""
 _SECTIONS: Final = """
 [condition]
 
@@ -71,6 +75,8 @@ class Step:
     """Writes within which it is killed."""
     records: str = ""
     """Digest of the records of outputs that it leaves."""
+    weight: float = 1.0
+    """How often it is drawn."""
 
 
 @dataclass
@@ -132,16 +138,20 @@ def prepare(place: Place, runs: Guest, said: Callable[[str], object]) -> Base:
     asked = [stage for stage in stages() if stage.is_asked(survey)]
     costs = []
     for stage in asked:
-        answer = _checked(runs, ("stage", stage.name, SURVEY))
+        command = ("stage", stage.name, SURVEY)
+        answer = _checked(runs, command)
         costs.append((stage.name, before, answer["seconds"], answer["writes"]))
-        before = f"before the end of {stage.name}"
-        made.states[before] = place.take()
+        after = f"after {stage.name}"
+        made.states[after] = place.take()
+        step = Step(f"stage: {stage.name}", command, before, after, answer["seconds"], answer["writes"])
+        made.steps.append(replace(step, records=records_of(place), weight=_OFTEN))
+        before = after
         said(f"{stage.name}: {answer}")
     answer = _checked(runs, RUN)
     costs.append(("report", before, answer["seconds"], answer["writes"]))
     made.states["run"] = place.take()
     known = records_of(place)
-    made.steps = [Step(f"run: {n}", RUN, b, "run", 1.2 * s + 0.2, w + 3, known) for n, b, s, w in costs]
+    made.steps += [Step(f"run: {n}", RUN, b, "run", 1.2 * s + 0.2, w + 3, known) for n, b, s, w in costs]
     root = f"survey={survey.config.id}/"
     for gone in GONE:
         kept = {name: of for name, of in made.states["run"].items() if f"{root}{gone}/" not in name}
@@ -149,7 +159,7 @@ def prepare(place: Place, runs: Guest, said: Callable[[str], object]) -> Base:
         place.put(kept)
         answer = _checked(runs, RUN)
         made.steps.append(
-            Step(f"run: {gone}", RUN, f"without {gone}", "run", answer["seconds"], answer["writes"], known)
+            Step(f"run: {gone}", RUN, f"without {gone}", "run", answer["seconds"], answer["writes"], known, _SELDOM)
         )
         said(f"{gone}: {answer}")
     place.put(made.states["run"])

@@ -22,13 +22,13 @@ from roadscan.survey.forgotten import forgotten_pictures
 from tests.kills.states import Place, State
 from tests.kills.steps import ARCHIVE, SURVEY, Base, Guest, Step, other_of, records_of, store_of
 
-MOST_KILLS: Final = 4
+MOST_KILLS: Final = 6
 """Most kills of a draw: each begins where the one before it left."""
 READERS: Final = (
     ("verify", SURVEY), ("status", SURVEY), ("inventory", "status", SURVEY),
     ("sql", "SELECT count(*) AS n FROM trajectory", "--survey", SURVEY),
 )  # fmt: skip
-"""Commands that look, of which one is drawn after each kill."""
+"""Commands that look, of which one is drawn after every other kill, for they cost as much as a kill."""
 VOLATILE: Final = ("manifest/verified.parquet", "manifest/lock")
 """Ends of names of files that tell of the last command."""
 RECORDED: Final = ("manifest/history/", "manifest/outputs/")
@@ -60,9 +60,10 @@ class Draw:
 def draws(place: Place, base: Base, runs: Guest, seed: int, numbers: range, only: str = "") -> Iterator[Draw]:
     """Draw a step, and how it is killed, for each number."""
     steps = [step for step in base.steps if only in step.name]
+    weights = np.array([step.weight for step in steps])
     for number in numbers:
         random = np.random.default_rng([seed, number])
-        step = steps[int(random.integers(len(steps)))]
+        step = steps[int(random.choice(len(steps), p=weights / weights.sum()))]
         draw = Draw(number, step.name)
         place.put(base.states[step.before])
         try:
@@ -77,6 +78,7 @@ def _try(place: Place, base: Base, runs: Guest, step: Step, random: np.random.Ge
     gone = step.before.removeprefix("without ") if step.before.startswith("without ") else "?"
     for _ in range(int(random.integers(1, MOST_KILLS + 1))):
         by_writes, share = random.random() < 0.5, random.random()
+        looks = random.random() < 0.5
         reader = READERS[int(random.integers(len(READERS)))]
         kill = {"writes": 1 + int(share * step.writes)} if by_writes else {"seconds": share * step.seconds}
         answer = runs.ask(step.command, **kill)
@@ -84,6 +86,8 @@ def _try(place: Place, base: Base, runs: Guest, step: Step, random: np.random.Ge
             break
         draw.kills.append(f"write {kill['writes']}" if by_writes else f"{kill['seconds']:.2f} s")
         draw.faults += [f"after {draw.kills[-1]}: {one}" for one in look(place, before, gone)]
+        if not looks:
+            continue
         answer = runs.ask(reader)
         lost = gone != "?" and reader[0] == "verify"  # it was taken away
         if answer["ended"] not in ("0", "1") or "Traceback" in runs.said() or ("damage" in runs.said() and not lost):

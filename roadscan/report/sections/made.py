@@ -106,7 +106,7 @@ def _small_picture(store: Store, record: OutputRecord) -> bytes | None:
         return _png(picture)
     if store.is_folder:
         path = store.path(record.path)
-        if record.bytes <= _MOST_BYTES and not digest_holds(Path(path), record.digest):
+        if record.digest and record.bytes <= _MOST_BYTES and not digest_holds(Path(path), record.digest):
             raise DamagedError("the file is not as it was recorded", change=MADE_AGAIN, file=path)
         return _png(_reduced(path))
     with MemoryFile(read_recorded(store, record)) as held:

@@ -2,8 +2,8 @@
 
 A line on standard input is a JSON object: `command`, the words after ``roadscan`` (or `stage`, a stage's name and the
 survey file); `folder`, in which it runs; `log`, a file for what it says; `seconds` of processor time, or `writes` of
-the file system or the object store, after which SIGKILL ends it (left out: it lives). A line on standard output tells how
-it `ended` (``killed``, or the exit status), the `seconds` that it took, and its `writes`.
+the file system or the object store, after which SIGKILL ends it (left out: it lives). A line on standard output tells
+how it `ended` (``killed``, or the exit status), the `seconds` that it took, and its `writes`.
 
 Times that commands write into files are always the same, so that files can be compared to the byte.
 """

@@ -105,7 +105,7 @@ def _try(place: Place, base: Base, runs: Guest, step: Step, random: np.random.Ge
 
 def look(place: Place, before: State, gone: str = "?") -> list[str]:
     """What is half done, as a reader who takes no lock finds it."""
-    faults = list(_store_faults(store_of(place), gone))
+    faults = list(store_faults(store_of(place), gone))
     site = place.work / "site"
     if (site / KEYS).exists():
         digests = parse_checked((site / KEYS).read_bytes())["digests"]
@@ -123,7 +123,7 @@ def look(place: Place, before: State, gone: str = "?") -> list[str]:
     return faults
 
 
-def _store_faults(store: Store, gone: str) -> Iterator[str]:
+def store_faults(store: Store, gone: str) -> Iterator[str]:
     """What records name is there, in its size, or was taken away before the command."""
     for record in read_log_records(store):
         for file in (one for own in record.tables.values() for one in own):

@@ -2,8 +2,9 @@
 
 A line on standard input is a JSON object: `command`, the words after ``roadscan`` (or `stage`, a stage's name and the
 survey file); `folder`, in which it runs; `log`, a file for what it says; `seconds` of processor time, or `writes` of
-the file system or the object store, after which SIGKILL ends it (left out: it lives). A line on standard output tells
-how it `ended` (``killed``, or the exit status), the `seconds` that it took, and its `writes`.
+the file system or the object store, after which SIGKILL ends it (left out: it lives); or `wall_s`, seconds after which
+SIGKILL ends it, or with `of_worker` one of its workers. A line on standard output tells how it `ended` (``killed``, or
+the exit status), the `seconds` that it took, its `writes`, and how many of its workers were `left` behind.
 
 Times that commands write into files are always the same, so that files can be compared to the byte.
 """
@@ -38,6 +39,10 @@ _TIMED: Final = ("roadscan.core.gpstime", "roadscan.store.asset_truth", "roadsca
 """Modules that write the present instant into files."""
 _LOOKS_S: Final = 0.004
 """Time between looks at the processor time of a command (s)."""
+
+
+_LONGEST_END_S: Final = 30.0
+"""Time within which workers end after their run (s)."""
 
 
 class _Fixed(datetime.datetime):
@@ -105,9 +110,18 @@ def done(asked: dict[str, Any]) -> dict[str, Any]:
     child = os.fork()
     if child == 0:
         _run(asked, writes)
-    used, seconds = psutil.Process(child), asked.get("seconds")
-    ended, last_s = None, 0.0
+    used, seconds, wall_s = psutil.Process(child), asked.get("seconds"), asked.get("wall_s")
+    ended, last_s, began_s = None, 0.0, time.monotonic()
+    workers: list[psutil.Process] = []
+    killed = 0
     while ended is None:
+        if wall_s is not None and not killed and time.monotonic() - began_s >= wall_s:
+            workers = _workers(used)
+            victim = (workers or [None])[int(1e3 * wall_s) % max(len(workers), 1)] if asked.get("of_worker") else used
+            if victim is not None:
+                with contextlib.suppress(psutil.NoSuchProcess):
+                    victim.kill()
+                    killed = 1
         with contextlib.suppress(psutil.NoSuchProcess):
             last_s = sum(used.cpu_times()[:2])
         if seconds is not None and last_s >= seconds:
@@ -117,7 +131,15 @@ def done(asked: dict[str, Any]) -> dict[str, Any]:
         ended = _status(child, os.WNOHANG)
         if ended is None:
             time.sleep(_LOOKS_S)
-    return {"ended": ended, "seconds": last_s, "writes": writes.count}
+    _, left = psutil.wait_procs(workers, timeout=_LONGEST_END_S)
+    return {"ended": ended, "seconds": last_s, "writes": writes.count, "left": len(left), "killed": killed}
+
+
+def _workers(run: psutil.Process) -> list[psutil.Process]:
+    """Workers of a run, and what else it started."""
+    with contextlib.suppress(psutil.NoSuchProcess):
+        return [one for one in run.children(recursive=True) if "spawn_main" in " ".join(one.cmdline())]
+    return []
 
 
 def _run(asked: dict[str, Any], writes: Writes) -> None:

@@ -27,6 +27,7 @@ from tests.surveys import small_scene
 
 SURVEY: Final = "survey/SURVEY.toml"
 RUN: Final = ("run", SURVEY, "--workers", "0")
+ON_DASK: Final = ("run", SURVEY, "--workers", "2")
 ARCHIVE: Final = "{other}/archive"
 """Folder of the archive: beside the survey, or in the bucket."""
 GONE: Final = ("manifest/outputs", "manifest/logs", "tables/footprints", "tiles", "products")
@@ -36,6 +37,8 @@ _OFTEN: Final = 3.0
 """Weight of a stage alone: it costs least."""
 _SELDOM: Final = 0.5
 """Weight of a run that makes most of a store again: it costs most."""
+_START_S: Final = 12.0
+"""Time (s) that a run's workers take to start and do the rest."""
 _SECTIONS: Final = """
 [condition]
 
@@ -70,9 +73,9 @@ class Step:
     after: str
     """Name of the state that it leaves."""
     seconds: float
-    """Processor time within which it is killed."""
+    """Processor time within which it is killed; time where it runs on workers."""
     writes: int
-    """Writes within which it is killed."""
+    """Writes within which it is killed; 0 where it runs on workers."""
     records: str = ""
     """Digest of the records of outputs that it leaves."""
     weight: float = 1.0
@@ -152,6 +155,9 @@ def prepare(place: Place, runs: Guest, said: Callable[[str], object]) -> Base:
     made.states["run"] = place.take()
     known = records_of(place)
     made.steps += [Step(f"run: {n}", RUN, b, "run", 1.2 * s + 0.2, w + 3, known) for n, b, s, w in costs]
+    made.steps += [
+        Step(f"workers: {n}", ON_DASK, b, "run", _START_S + 3 * s, 0, known, _SELDOM) for n, b, s, w in costs if s > 0.5
+    ]
     root = f"survey={survey.config.id}/"
     for gone in GONE:
         kept = {name: of for name, of in made.states["run"].items() if f"{root}{gone}/" not in name}

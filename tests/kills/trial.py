@@ -81,10 +81,15 @@ def _try(place: Place, base: Base, runs: Guest, step: Step, random: np.random.Ge
         looks = random.random() < 0.5
         reader = READERS[int(random.integers(len(READERS)))]
         kill = {"writes": 1 + int(share * step.writes)} if by_writes else {"seconds": share * step.seconds}
+        if not step.writes:
+            kill = {"wall_s": share * step.seconds, "of_worker": by_writes}
         answer = runs.ask(step.command, **kill)
-        if answer["ended"] != "killed":
+        if answer["killed"] or answer["ended"] == "killed":
+            draw.kills.append(" ".join(f"{name} {value:.4g}" for name, value in kill.items()))
+        if answer["left"]:
+            draw.faults.append(f"after {draw.kills[-1]}: {answer['left']} workers live on")
+        if answer["ended"] != "killed" and not (answer["killed"] and answer["ended"] == "2"):  # it named what it lost
             break
-        draw.kills.append(f"write {kill['writes']}" if by_writes else f"{kill['seconds']:.2f} s")
         draw.faults += [f"after {draw.kills[-1]}: {one}" for one in look(place, before, gone)]
         if not looks:
             continue

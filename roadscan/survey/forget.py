@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from roadscan.core.errors import ConfigError, RoadscanError, nearest
+from roadscan.core.errors import ConfigError, DamagedError, RoadscanError, nearest
 from roadscan.core.gpstime import now_utc
 from roadscan.ingest.planned_logs import PlannedLog, logs_of
 from roadscan.ingest.sources import listed_name
@@ -144,6 +144,22 @@ def forget(session: Session, chosen: Collection[Chosen], why: str, archives: Seq
         except OSError as error:
             left.append(f"{one.path}: {error.strerror}")
     return Told(removed, archived, tuple(left))
+
+
+def still_there(session: Session) -> list[str]:
+    """Return the forgotten pictures that are at their places all the same, in words: the command was stopped.
+
+    Where the record is damaged, there are none: `verify` says that by itself.
+    """
+    try:
+        known = forgotten_pictures(session.store)
+    except DamagedError:
+        return []
+    return [
+        f"{one.path}: it is among the forgotten pictures and is still there; call the same `roadscan forget` again"
+        for one in known
+        if session.survey.resolve(Path(one.path)).exists()
+    ]
 
 
 def _folders(session: Session) -> Iterator[PlannedLog]:

@@ -35,8 +35,10 @@ GONE: Final = ("manifest/outputs", "manifest/logs", "tables/footprints", "tiles"
 PICTURES: Final = tuple(f"run-1/camera/{number:06d}.jpg" for number in (0, 1))
 _OFTEN: Final = 3.0
 """Weight of a stage alone: it costs least."""
-_SELDOM: Final = 0.5
-"""Weight of a run that makes most of a store again: it costs most."""
+_SELDOM: Final = 0.3
+"""Weight of a run from a stage on."""
+_RARELY: Final = 0.1
+"""Weight of a run that makes most of a store again, or starts workers: it costs ten times as much as a stage."""
 _START_S: Final = 12.0
 """Time (s) that a run's workers take to start and do the rest."""
 _SECTIONS: Final = """
@@ -154,16 +156,16 @@ def prepare(place: Place, runs: Guest, said: Callable[[str], object]) -> Base:
     costs.append(("report", before, answer["seconds"], answer["writes"]))
     made.states["run"] = place.take()
     known = records_of(place)
-    made.steps += [Step(f"run: {n}", RUN, b, "run", 1.2 * s + 0.2, w + 3, known) for n, b, s, w in costs]
+    made.steps += [Step(f"run: {n}", RUN, b, "run", 1.2 * s + 0.2, w + 3, known, _SELDOM) for n, b, s, w in costs]
     made.steps += [
-        Step(f"workers: {n}", ON_DASK, b, "run", _START_S + 3 * s, 0, known, _SELDOM) for n, b, s, w in costs if s > 0.5
+        Step(f"workers: {n}", ON_DASK, b, "run", _START_S + 3 * s, 0, known, _RARELY) for n, b, s, w in costs if s > 0.5
     ]
     all_s, all_writes = sum(s for _, _, s, _ in costs), sum(w for *_, w in costs)
     root = f"survey={survey.config.id}/"
     for gone in GONE:
         kept = {name: of for name, of in made.states["run"].items() if f"{root}{gone}/" not in name}
         made.states[f"without {gone}"] = kept
-        made.steps.append(Step(f"run: {gone}", RUN, f"without {gone}", "run", all_s, all_writes, known, _SELDOM))
+        made.steps.append(Step(f"run: {gone}", RUN, f"without {gone}", "run", all_s, all_writes, known, _RARELY))
     place.put(made.states["run"])
     _prepare_commands(place, runs, made, said)
     return made

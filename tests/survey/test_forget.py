@@ -91,6 +91,10 @@ def test_a_command_that_is_stopped_is_called_again(
     with monkeypatch.context() as patch:
         patch.setattr(stops_at, name, stopped)
         assert cli(*command).exit_code != 0
+    told = cli("verify", survey)
+    left = [name for name in gone if name in pictures(drive)]
+    assert left and told.exit_code == 1
+    assert all(f"{name}: it is among the forgotten pictures and is still there" in told.output for name in left)
     done = cli(*command)
     assert done.exit_code == 0, (done.output, done.exception)
     assert not set(gone) & set(pictures(drive))

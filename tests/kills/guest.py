@@ -78,6 +78,7 @@ class Writes:
         self.folder, self.last = folder, last
         sys.addaudithook(self._heard)
         import s3fs
+        from fsspec.asyn import sync_wrapper
 
         call = s3fs.S3FileSystem._call_s3
 
@@ -87,6 +88,7 @@ class Writes:
             return await call(fs, method, *args, **kwargs)
 
         s3fs.S3FileSystem._call_s3 = counted
+        s3fs.S3FileSystem.call_s3 = sync_wrapper(counted)  # files that are written as streams call this one
 
     def step(self) -> None:
         """Count one, or die."""

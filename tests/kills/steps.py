@@ -77,7 +77,7 @@ class Step:
     seconds: float
     """Processor time within which it is killed; time where it runs on workers."""
     writes: int
-    """Writes within which it is killed; 0 where it runs on workers."""
+    """Writes within which it is killed, where it runs on no workers."""
     records: str = ""
     """Digest of the records of outputs that it leaves."""
     weight: float = 1.0
@@ -158,7 +158,7 @@ def prepare(place: Place, runs: Guest, said: Callable[[str], object]) -> Base:
     known = records_of(place)
     made.steps += [Step(f"run: {n}", RUN, b, "run", 1.2 * s + 0.2, w + 3, known, _SELDOM) for n, b, s, w in costs]
     made.steps += [
-        Step(f"workers: {n}", ON_DASK, b, "run", _START_S + 3 * s, 0, known, _RARELY) for n, b, s, w in costs if s > 0.5
+        Step(f"workers: {n}", ON_DASK, b, "run", _START_S + 3 * s, w, known, _RARELY) for n, b, s, w in costs if s > 0.5
     ]
     all_s, all_writes = sum(s for _, _, s, _ in costs), sum(w for *_, w in costs)
     root = f"survey={survey.config.id}/"

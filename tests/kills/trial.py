@@ -20,7 +20,7 @@ from roadscan.store.store import Store
 from roadscan.survey.archive import Archive
 from roadscan.survey.forgotten import forgotten_pictures
 from tests.kills.states import Place, State
-from tests.kills.steps import ARCHIVE, SURVEY, Base, Guest, Step, other_of, records_of, store_of
+from tests.kills.steps import ARCHIVE, ON_DASK, SURVEY, Base, Guest, Step, other_of, records_of, store_of
 
 MOST_KILLS: Final = 6
 """Most kills of a draw: each begins where the one before it left."""
@@ -77,11 +77,11 @@ def _try(place: Place, base: Base, runs: Guest, step: Step, random: np.random.Ge
     before = base.states[step.before]
     gone = step.before.removeprefix("without ") if step.before.startswith("without ") else "?"
     for _ in range(int(random.integers(1, MOST_KILLS + 1))):
-        by_writes, share = random.random() < 0.5, random.random()
+        by_writes, share = random.random() < 0.5 and step.writes > 0, random.random()
         looks = random.random() < 0.5
         reader = READERS[int(random.integers(len(READERS)))]
         kill = {"writes": 1 + int(share * step.writes)} if by_writes else {"seconds": share * step.seconds}
-        if not step.writes:
+        if step.command == ON_DASK:
             kill = {"wall_s": share * step.seconds, "of_worker": by_writes}
         answer = runs.ask(step.command, **kill)
         if answer["killed"] or answer["ended"] == "killed":

@@ -72,6 +72,7 @@ def verify(
     from roadscan.inventory.of_survey import inventory_faults
     from roadscan.run.session import Session
     from roadscan.store.salvage import read_lost
+    from roadscan.survey.forget import still_there
     from roadscan.survey.repair import accept_losses as accept
     from roadscan.survey.repair import repair_store
     from roadscan.survey.status import verify_store
@@ -83,7 +84,7 @@ def verify(
         faults, told = mended.faults, mended.lines
     else:
         faults = verify_store(session.store, lambda d, t: reporter.progress("verify", d, t))
-    faults += inventory_faults(session.survey)
+    faults += [*inventory_faults(session.survey), *still_there(session)]
     reporter.close()
     if accept_losses:
         accept(session.store)

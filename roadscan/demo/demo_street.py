@@ -85,13 +85,13 @@ def edit_by_hand(survey_file: Path) -> HandEdit:
     rows = inventory.assets(_KIND).sort_values("station_m")
     asset_id = str(rows["asset_id"].iloc[0])
     found = inventory.state().row(asset_id, evidence=True) or {}
-    _write_value(inventory.home.name, asset_id)
+    write_height(inventory.home.name, asset_id)
     inventory.pull(who="demo", why="the height of its maker's list")
     return HandEdit(asset_id, _ATTRIBUTE, float(found[_ATTRIBUTE]), _VALUE)
 
 
-def _write_value(file: str, asset_id: str) -> None:
-    """Write the value into the layer, as QGIS does it: through GDAL."""
+def write_height(file: str, asset_id: str) -> None:
+    """Write the height of a pole into its layer of a home, as QGIS does it: through GDAL."""
     import pyogrio
 
     layer = pyogrio.read_dataframe(file, layer=_LAYER, fid_as_index=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-import uuid
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.sources import ReadingSource
+from roadscan.store.holding.beside import beside
 from roadscan.store.logs import DataFile
 
 
@@ -47,7 +47,7 @@ def published(out: Path) -> Iterator[Path]:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"{out} is there already", expected="a new or empty folder", change="choose another --out")
     out.parent.mkdir(parents=True, exist_ok=True)
-    scratch = out.parent / f".{out.name}-{uuid.uuid4().hex}"
+    scratch = beside(out)
     scratch.mkdir()
     try:
         yield scratch

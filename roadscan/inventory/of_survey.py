@@ -133,10 +133,11 @@ def found_assets(session: Session) -> Found | None:
     store = session.store
     tables: dict[str, pa.Table] = {}
     digests: list[str] = []
+    records = {record.path: record for record in session.manifest.all()}
     for kind in asset_kind_names():
         file = f"{FOUND}/{asset_schema(kind).table}.parquet"
         if store.exists(file):
-            content = store.read_bytes(file)
+            content = read_recorded(store, records[file]) if file in records else store.read_bytes(file)
             tables[kind] = store.parse_table(content, file)
             digests.append(f"{kind}:{bytes_digest(content)}")
     for one in found_distresses(session):

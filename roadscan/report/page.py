@@ -41,10 +41,11 @@ def report_page(session: Session) -> str:
 
 
 def _made(session: Session) -> tuple[str, list[str]]:
-    """Return the report, and why sections of it could not be made, in words."""
+    """Return the report, and what it lacks because that could not be made, in words."""
     config, failed = session.survey.config, list[str]()
     material = Material(session)
     parts = [part for part in (_part(section, material, failed) for section in sections()) if part.blocks]
+    failed += [f"what is damaged: {words}" for words in material.faults]
     lead = (
         f"Report of the survey {config.id}. Lengths are in metres unless a unit is named; σ is one standard "
         "deviation; times are UTC."
@@ -71,7 +72,7 @@ def keep_report(session: Session) -> str:
     if not manifest.is_current(REPORT, REPORT, key):
         page, failed = _made(session)
         for words in failed:
-            session.note(f"the report lacks a section: {words}")
+            session.note(f"the report lacks {words}")
 
         def write(file: Path) -> None:
             file.write_bytes(page.encode("utf-8"))
@@ -106,6 +107,6 @@ def _part(section: Section, material: Material, failed: list[str]) -> Part:
     try:
         return Part(section.name, section.title, tuple(section.blocks(material)))
     except RoadscanError as error:
-        failed.append(f"{section.title}: {error}")
+        failed.append(f"a section: {section.title}: {error}")
         told = Paragraph(f"This section could not be made: {error}", is_warning=True)
         return Part(section.name, section.title, (told,))

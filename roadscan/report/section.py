@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar, Final
 
@@ -29,6 +29,8 @@ class Material:
     """The data of a survey for sections; shared results are computed once."""
 
     session: Session
+    faults: list[str] = field(default_factory=list)
+    """What sections left out because a file is damaged, in words."""
 
     @cached_property
     def summary(self) -> SurveySummary:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import base64
-import uuid
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Final
 
 from roadscan.core.errors import ConfigError
 from roadscan.site.material import Material
 from roadscan.site.site import KEYS, REPORT_PAGE, publish
 from roadscan.site.web_part import DATA_MARK, single_page
+from roadscan.store.holding.beside import beside
 
 LARGEST_MB: Final = 200.0
 """Larger pages open slowly in browsers."""
@@ -53,8 +53,9 @@ def write_single(
     """
     page = single_page()
     left_out: list[str] = []
-    with TemporaryDirectory(prefix=".single-", dir=path.absolute().parent) as scratch:
-        folder = Path(scratch) / "site"
+    scratch = beside(path.absolute())
+    try:
+        folder = scratch / "site"
         for wished, without in _ever_less(material):
             if without:
                 left_out.append(without)
@@ -68,6 +69,8 @@ def write_single(
                 expected=f"{largest_mb:g} MB or less", change="name a road or a smaller --box",
             )  # fmt: skip
         _write(path, page, folder)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
     failed = [f"{document}: {why}" for document, why in held.failures]
     return SinglePage(path, path.stat().st_size, (*left_out, *failed))
 
@@ -106,7 +109,7 @@ def _size(file: Path) -> float:
 def _write(path: Path, page: str, folder: Path) -> None:
     """Write the page with all files embedded, atomically."""
     before, after = page.split(DATA_MARK)
-    scratch = path.with_name(f".{path.name}-{uuid.uuid4().hex}")
+    scratch = beside(path.absolute())
     try:
         with scratch.open("wb") as stream:
             stream.write(before.encode())

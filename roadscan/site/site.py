@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import os
 import shutil
-import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +25,7 @@ from roadscan.site.web_part import web_documents
 from roadscan.store.checked_json import checked_json, parse_checked
 from roadscan.store.codecs import SOFTWARE
 from roadscan.store.digest import file_digest
+from roadscan.store.holding.beside import beside, put_folder
 from roadscan.store.manifest import read_recorded
 
 LAYOUT: Final = 1  # version of the site's layout
@@ -97,7 +96,7 @@ class Published:
 
 
 def publish(material: Material, out: Path, report: Callable[[int, int], None] = lambda _a, _b: None) -> Published:
-    """Publish the site as a folder, written under another name and then renamed.
+    """Publish the site as a folder, written under another name and then put in its place.
 
     What a folder that was published before holds unchanged is taken over.
 
@@ -107,8 +106,8 @@ def publish(material: Material, out: Path, report: Callable[[int, int], None] = 
         where `out` holds something else than a site.
     """
     known, damaged = known_files(out)
-    scratch = out.parent / f".{out.name}-{uuid.uuid4().hex}"
     out.parent.mkdir(parents=True, exist_ok=True)
+    scratch = beside(out)
     scratch.mkdir()
     try:
         writer = _Writer(scratch, known)
@@ -120,7 +119,7 @@ def publish(material: Material, out: Path, report: Callable[[int, int], None] = 
         report(len(documents), len(documents))
         told = {"layout": LAYOUT, "keys": writer.keys, "digests": writer.digests}
         (scratch / KEYS).write_bytes(checked_json(told))
-        _exchange(scratch, out)
+        put_folder(scratch, out)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
     left_out = (*site_layers(material)[1], *_lost_report(material))
@@ -198,20 +197,6 @@ def _linked(known: Path, path: Path) -> None:
         os.link(known, path)
     except OSError:
         shutil.copyfile(known, path)
-
-
-def _exchange(scratch: Path, out: Path) -> None:
-    """Replace a folder by another in two renames, then delete the old one."""
-    old = out.parent / f".{out.name}-{uuid.uuid4().hex}"
-    if out.exists():
-        out.rename(old)
-    try:
-        scratch.rename(out)
-    except OSError:
-        with contextlib.suppress(OSError):
-            old.rename(out)
-        raise
-    shutil.rmtree(old, ignore_errors=True)
 
 
 def _report(material: Material) -> Any:

@@ -213,6 +213,7 @@ class AssetTruth:
             ) from error
         try:
             _take(opened, file, time.monotonic() + wait_s)
+            self.store.clear_staging()
             self.renew()
             yield
         finally:

@@ -366,6 +366,12 @@ def read_recorded(store: Store, record: OutputRecord) -> bytes:
     return content
 
 
+def recorded_rows(store: Store, records: Iterable[OutputRecord]) -> list[dict[str, Any]]:
+    """Return the rows of outputs that are Parquet files, each verified as by :func:`read_recorded`."""
+    held = (record for record in records if record.path)
+    return [row for r in held for row in store.parse_table(read_recorded(store, r), r.path).to_pylist()]
+
+
 def is_changing(store: Store) -> bool:
     """Return whether a run is at work, or ended before all was done."""
     return store.exists(_CHANGING)

@@ -77,8 +77,11 @@ def write_small(store: Store, name: str, rows: Iterable[Mapping[str, Any]]) -> N
     pq.write_table(table, sink, row_group_size=schema.row_group_rows, compression="zstd", write_page_checksum=True)
     content = sink.getvalue().to_pybytes()
     known = _known(store)
+    of = known.get(name, {})
+    held = bytes_digest(store.read_bytes(small_path(name))) if store.exists(small_path(name)) else None
+    before = held if held in (of.get("digest"), of.get("before")) else None  # the last writing may have been cut short
     both = {"bytes": len(content), "digest": bytes_digest(content)}
-    store.write_bytes(_DIGESTS, checked_json({**known, name: {**both, "before": known.get(name, {}).get("digest")}}))
+    store.write_bytes(_DIGESTS, checked_json({**known, name: {**both, "before": before}}))
     store.write_bytes(small_path(name), content)
 
 

@@ -379,7 +379,7 @@ class Store:
         try:
             self._lease = lease
             if self.is_folder:
-                self._clear_staging()
+                self.clear_staging()
             with self.looked(anew=True):  # somebody else may have written before
                 self.check_version()
                 yield
@@ -451,7 +451,7 @@ class Store:
         _make_folder(named.parent, lasting=True)
         return named
 
-    def _clear_staging(self) -> None:
+    def clear_staging(self) -> None:
         """Remove temporary files of dead processes, and of other machines' after some hours."""
         parent = Path(self.path(_STAGING))
         for left in parent.iterdir() if parent.is_dir() else ():

@@ -8,6 +8,7 @@ counts.
 
 from __future__ import annotations
 
+import contextlib
 import datetime as dt
 import hashlib
 import io
@@ -105,8 +106,11 @@ class Archive:
             return None
 
     def remove(self, place: str) -> None:
-        """Remove a file that is not what it should be."""
-        self._fs.rm_file(f"{self._root}/{place}")
+        """Remove a file if it is there, with what a stopped command had written of it."""
+        path = f"{self._root}/{place}"
+        for one in (path, str(_part_of(Path(path)))) if self._is_folder else (path,):
+            with contextlib.suppress(FileNotFoundError):
+                self._fs.rm_file(one)
 
     def fetch(self, place: str, file: Path) -> None:
         """Copy a file of the archive to a local place."""
@@ -125,10 +129,15 @@ class Archive:
 def _copy_whole(stream: IO[bytes], file: Path) -> None:
     """Write a local file under another name first, so that it is there whole or not at all."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_name(f".{file.name}.part")
+    part = _part_of(file)
     with part.open("wb") as target:
         shutil.copyfileobj(stream, target, _CHUNK)
     part.replace(file)
+
+
+def _part_of(file: Path) -> Path:
+    """Return the name under which a local file is written first."""
+    return file.with_name(f".{file.name}.part")
 
 
 def archive(

@@ -18,6 +18,7 @@ from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.store.logs import NAVIGATION, LogRecord, copy_path, log_of, read_log_records, record_path
 from roadscan.store.store import Store
+from roadscan.tiles.product import products as known_products
 
 SUPERSEDED: Final = "superseded"
 """Rows of logs that were read again with other settings."""
@@ -64,7 +65,7 @@ def waste_of(
     Raises
     ------
     ConfigError
-        for a kind that there is not, and a product without files.
+        for a kind that there is not, and a product that there is not.
     RunError
         where a log of the survey file cannot be read, so that nobody knows which logs are unused.
     """
@@ -72,7 +73,7 @@ def waste_of(
     if unknown := [kind for kind in kinds if kind not in KINDS]:
         raise ConfigError(f"nothing is called '{unknown[0]}'", expected=", ".join(KINDS), change="name one of these")
     made = session.manifest.files()
-    if missing := [product for product in products if product not in made]:
+    if missing := [product for product in products if product not in made and product not in known_products()]:
         raise ConfigError(f"the store has no file of '{missing[0]}'", expected=f"one of {', '.join(sorted(made))}")
     records = read_log_records(store)
     unused = _unused(session, records) if UNUSED in kinds else set()

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from roadscan.core.errors import ConfigError, RoadscanError, nearest
+from roadscan.core.errors import ConfigError, DamagedError, RoadscanError, nearest
 from roadscan.core.gpstime import now_utc
 from roadscan.ingest.planned_logs import PlannedLog, logs_of
 from roadscan.ingest.sources import listed_name
@@ -62,14 +62,16 @@ class Told:
 
 
 def choose_named(session: Session, names: Sequence[str]) -> list[Chosen]:
-    """Return pictures by their names RUN/CAMERA/FILE.
+    """Return pictures by their names RUN/CAMERA/FILE, also those that went: a command that was stopped is called again.
 
     Raises
     ------
     ConfigError
         where one is no picture of the survey, or a frame of a video.
     """
-    there = {one.name: one for log in _folders(session) for one in _pictures_of(log)}
+    logs = list(_folders(session))
+    there = {one.name: one for log in logs for one in _pictures_of(log)}
+    there = {one.name: one for one in _gone(session, logs)} | there
     chosen = []
     for name in dict.fromkeys(names):
         if name not in there:
@@ -129,19 +131,35 @@ def forget(session: Session, chosen: Collection[Chosen], why: str, archives: Seq
     for archive, files in opened:
         for path in set(paths.values()) | {one.path for one in known}:
             place = archive_place(path)
-            if place in files or archive.size(place) is not None:
-                archive.remove(place)
-                archived += 1
+            archived += archive.size(place) is not None
+            archive.remove(place)
             files.pop(place, None)
         archive.write_list(session.survey.config.id, files)
     removed = 0
     for one in chosen:
         try:
+            is_there = one.path.exists()
             one.path.unlink(missing_ok=True)
-            removed += 1
+            removed += is_there
         except OSError as error:
             left.append(f"{one.path}: {error.strerror}")
     return Told(removed, archived, tuple(left))
+
+
+def still_there(session: Session) -> list[str]:
+    """Return the forgotten pictures that are at their places all the same, in words: the command was stopped.
+
+    Where the record is damaged, there are none: `verify` says that by itself.
+    """
+    try:
+        known = forgotten_pictures(session.store)
+    except DamagedError:
+        return []
+    return [
+        f"{one.path}: it is among the forgotten pictures and is still there; call the same `roadscan forget` again"
+        for one in known
+        if session.survey.resolve(Path(one.path)).exists()
+    ]
 
 
 def _folders(session: Session) -> Iterator[PlannedLog]:
@@ -150,6 +168,15 @@ def _folders(session: Session) -> Iterator[PlannedLog]:
     if unplanned:
         raise RoadscanError(f"a log cannot be read: {unplanned[0].error}", change="put it right first")
     yield from (log for log in planned if log.format.name == _LOG and log.source.path.is_dir())
+
+
+def _gone(session: Session, logs: Sequence[PlannedLog]) -> Iterator[Chosen]:
+    """Yield pictures that were forgotten, of folders that are there."""
+    for one in forgotten_pictures(session.store):
+        path = session.survey.resolve(Path(one.path))
+        for log in logs:
+            if (log.run, log.sensor) == (one.run, one.camera) and path.is_relative_to(log.source.path):
+                yield Chosen(log.run, log.sensor, path.relative_to(log.source.path).as_posix(), log.source.path)
 
 
 def _pictures_of(log: PlannedLog) -> Iterator[Chosen]:

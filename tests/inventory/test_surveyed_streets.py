@@ -12,10 +12,12 @@ from typing import Any, NamedTuple
 import geopandas
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 import roadscan
+from roadscan.core.errors import DamagedError
 from roadscan.demo.demo_street import (
     AUTUMN,
     SPRING,
@@ -27,11 +29,14 @@ from roadscan.demo.demo_street import (
     street,
 )
 from roadscan.inventory.inventory import Inventory
-from roadscan.inventory.of_survey import FOUND
+from roadscan.inventory.of_survey import FOUND, found_assets
+from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, simulate
 from roadscan.simulate.surface import Surface
 from roadscan.store.asset_schema import asset_schema
+from roadscan.store.digest import bytes_digest
+from roadscan.store.manifest import OutputRecord
 from roadscan.survey.run import run_stages
 from tests.inventory.streets import AUTUMN as IN_AUTUMN
 from tests.inventory.streets import found, poles
@@ -72,6 +77,25 @@ def test_the_demo_tells_of_two_epochs_and_of_the_edit_between(tmp_path: Path) ->
             f"hand edit     {edit.asset_id}: asset_height_m 3.00, in force; found 5.00 before it and 5.00 since"
         )
         assert edit_by_hand(files[AUTUMN]) == HandEdit(edit.asset_id, "asset_height_m", 5.0, 3.0)
+
+
+def test_found_assets_that_are_damaged_are_refused(tmp_path: Path) -> None:
+    """A flipped bit in a footer reads as another table: rows are taken in as their record says, or not at all."""
+    survey_file = tmp_path / "SURVEY.toml"
+    survey_file.write_text(SURVEY.format(SPRING))
+    session = Session.open(survey_file)
+    for kind, table in found(poles()).tables.items():
+        path = f"{FOUND}/{asset_schema(kind).table}.parquet"
+        sink = pa.BufferOutputStream()
+        pq.write_table(table, sink)
+        content = sink.getvalue().to_pybytes()
+        session.store.write_bytes(path, content)
+        digest = bytes_digest(content)
+        session.manifest.add([OutputRecord("assets", path, "key", path, len(content), digest)])
+    assert found_assets(session) is not None
+    session.store.write_bytes(path, content.replace(b"station_m", b"station_l"))
+    with pytest.raises(DamagedError, match="not as it was recorded"):
+        found_assets(Session.open(survey_file))
 
 
 def processed(survey_file: Path) -> Inventory:

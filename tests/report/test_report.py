@@ -26,7 +26,7 @@ from roadscan.site.report_copy import linked_report
 from roadscan.store.logs import read_log_records
 from roadscan.store.manifest import Manifest, write_failures
 from tests.drawing import drawn
-from tests.surveys import Simulated
+from tests.surveys import Lines, Simulated
 
 BROWSERS_OWN = re.compile(r"^https?://([\w-]+\.)*(google\.com|googleapis\.com|gvt1\.com)/")
 """What the browser asks for its own updates."""
@@ -188,4 +188,28 @@ def test_a_damaged_picture_is_named_in_its_place(finished: Simulated, tmp_path: 
     content = bytearray(store.read_bytes(path))
     content[len(content) // 2] ^= 1
     store.write_bytes(path, bytes(content))
-    assert f"{Path(path).name}: the file is not as it was recorded" in report_page(Session.open(copy.survey_file))
+    lines, session = Lines(), Session.open(copy.survey_file)
+    session.reporter = lines
+    store.remove(PATH)
+    keep_report(session)
+    assert f"{Path(path).name}: the file is not as it was recorded" in store.read_bytes(PATH).decode()
+    assert any(path in line for line in lines.lines), lines.lines  # nobody has to open the report to hear it
+
+
+def test_a_damaged_table_is_told_where_the_map_lacks_it(finished: Simulated, tmp_path: Path) -> None:
+    """A layer that cannot be drawn is named on the page and by the run; the page is made again when it can."""
+    copy = finished.copy_with_store_to(tmp_path / "survey")
+    store = copy.store()
+    (path,) = store.files("tables/control_points")
+    whole = store.read_bytes(path)
+    store.write_bytes(path, whole[: len(whole) // 2])
+    store.remove(PATH)
+    lines, session = Lines(), Session.open(copy.survey_file)
+    session.reporter = lines
+    keep_report(session)
+    told = "Not on the map: control: "
+    assert told in store.read_bytes(PATH).decode()
+    assert any("lacks what is damaged: not on the map: control: " in line for line in lines.lines), lines.lines
+    store.write_bytes(path, whole)
+    keep_report(Session.open(copy.survey_file))
+    assert told not in store.read_bytes(PATH).decode()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -13,7 +15,7 @@ import pytest
 from distributed import Client, LocalCluster
 
 import roadscan
-from roadscan.core.errors import RoadscanError
+from roadscan.core.errors import RoadscanError, RunError
 from roadscan.run.engine import embedded as own_cluster
 from roadscan.run.engine.embedded import embedded
 from roadscan.run.engine.on_dask import OnDask
@@ -66,6 +68,21 @@ def test_a_result_that_cannot_be_sent_is_its_tasks_error(cluster: OnDask, made: 
     ended = {done.task: done for done in cluster.map(result_of, [made, "sound"])}
     assert isinstance(ended[made].error, kind)
     assert ended["sound"].result == "sound"
+
+
+def test_a_scheduler_that_dies_while_it_is_asked_is_named(tmp_path: Path) -> None:
+    told = tmp_path / "scheduler.json"
+    words = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0"]
+    words += ["--no-dashboard", "--scheduler-file", str(told)]
+    with subprocess.Popen(words, stderr=subprocess.DEVNULL) as scheduler:
+        while not told.exists():
+            time.sleep(0.05)
+        with Client(scheduler_file=str(told), timeout="2s") as client:
+            asked = OnDask(client)
+            assert asked.workers == 1
+            scheduler.kill()
+            with pytest.raises(RunError, match=r"the Dask scheduler tcp://127\.0\.0\.1:\d+ is gone"):
+                asked.workers  # noqa: B018 — asking is what is tried
 
 
 def test_workers_that_are_gone_for_good_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -172,6 +172,8 @@ def commands_on(file: str) -> list[list[str]]:
         found += [["reprocess", survey, "--tile", TILE, "--workers", "0"]]
     elif inside.startswith(("tables/", "products/", "tiles/", "report/")):
         found += [["run", survey, "--workers", "0"], ["publish", survey, "--out", "site"]]
+    if inside.startswith(("products/assets/", "tables/asset_visibility/")):
+        found += [["inventory", "publish", survey]]
     if file.endswith(".parquet") and not inside.startswith("manifest/"):
         found += [["sql", f"SELECT * FROM 'store://survey=street/{inside}'", "--survey", survey, "--csv"]]
     return found

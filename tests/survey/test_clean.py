@@ -86,6 +86,8 @@ def test_age_and_products(finished: Simulated, tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     assert store.files("tiles/las") == []
     assert verify_store(store) == []
+    again = CliRunner().invoke(app, ["clean", str(copy.survey_file), "--product", "las", "--remove"])
+    assert again.exit_code == 0, again.output  # as after one that was killed when its records were gone
     copy.run()
     assert outputs(store) == {path: content for path, content in made.items() if path != STRAY}
 

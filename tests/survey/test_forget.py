@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
@@ -12,6 +13,7 @@ from typer.testing import CliRunner, Result
 from roadscan.cli import app
 from roadscan.core.errors import ConfigError, DamagedError
 from roadscan.core.gpstime import iso_from_gps_ns
+from roadscan.survey.archive import Archive
 from roadscan.survey.forgotten import FORGOTTEN, forgotten_pictures
 from tests.measuring.drive import Drive
 
@@ -64,6 +66,40 @@ def test_named_pictures_go_for_ever(drive: Drive, tmp_path: Path) -> None:
     for name in gone:
         kept = names_in(drive, name)
         assert FORGOTTEN in kept and all(path.startswith(("manifest/", "tables/rejects")) for path in kept), kept
+
+
+@pytest.mark.parametrize("stops_at", [Archive, Path])
+def test_a_command_that_is_stopped_is_called_again(
+    drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stops_at: type
+) -> None:
+    """It stops behind the removal of the first copy, or of the first file: then lists name what is gone."""
+    survey, archive = str(drive.survey_file), str(tmp_path / "archive")
+    assert cli("archive", survey, "--to", archive).exit_code == 0
+    gone = list(pictures(drive))[2:4]
+    (copy,) = Path(archive).rglob(gone[0])
+    (half := copy.with_name(f".{gone[0]}.part")).write_bytes(copy.read_bytes()[:2000])  # of a copy that was stopped
+    words = [word for one in gone for word in ("--picture", f"run-1/camera/{one}")]
+    command = ("forget", survey, *words, "--archive", archive, "--remove")
+    name = "remove" if stops_at is Archive else "unlink"
+    work = getattr(stops_at, name)
+
+    def stopped(one: Any, *args: Any, **more: Any) -> None:
+        work(one, *args, **more)
+        if stops_at is Archive or one.suffix == ".jpg":
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(stops_at, name, stopped)
+        assert cli(*command).exit_code != 0
+    told = cli("verify", survey)
+    left = [name for name in gone if name in pictures(drive)]
+    assert left and told.exit_code == 1
+    assert all(f"{name}: it is among the forgotten pictures and is still there" in told.output for name in left)
+    done = cli(*command)
+    assert done.exit_code == 0, (done.output, done.exception)
+    assert not set(gone) & set(pictures(drive))
+    assert not [path for path in Path(archive).rglob("*.jpg") if path.name in gone] and not half.exists()
+    assert cli("archive", survey, "--to", archive, "--check").exit_code == 0
 
 
 def test_a_span_of_time_goes(drive: Drive) -> None:

@@ -186,7 +186,7 @@ class Sampled:
 
 def read_samples(store: Store, record: OutputRecord) -> Sampled:
     """Returns the samples of a batch, in its order."""
-    table = store.read_table(record.path, _SAMPLED)
+    table = store.parse_table(read_recorded(store, record), record.path, _SAMPLED)
     samples = [
         PictureSample(np.asarray(c, np.int64), np.asarray(v, np.float32).reshape(-1, 3))
         for c, v in zip(table["cell"].to_pylist(), table["colour"].to_pylist(), strict=True)

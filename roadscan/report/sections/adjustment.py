@@ -16,6 +16,7 @@ from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.report.blocks import Block, Paragraph, Picture, Table
 from roadscan.report.section import Material, Section
 from roadscan.run.session import Session
+from roadscan.store.manifest import recorded_rows
 
 _MOST_TARGETS: Final = 24  # pictures of targets
 _TARGET_MM: Final = 25.0  # width of a target's picture
@@ -63,8 +64,7 @@ class Adjustment(Section):
 
 
 def _rows(session: Session, table: str) -> Rows:
-    records = session.manifest.of(table).values()
-    return [row for record in records if record.path for row in session.store.read_table(record.path).to_pylist()]
+    return recorded_rows(session.store, session.manifest.of(table).values())
 
 
 def _pictures(material: Material, paths: Sequence[str], caption: str, width_mm: float = 170.0) -> Iterator[Picture]:

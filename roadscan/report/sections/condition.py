@@ -14,6 +14,7 @@ from roadscan.condition.tasks.sections import known_sections
 from roadscan.report.blocks import Block, Paragraph, Picture, Table
 from roadscan.report.section import Material, Section
 from roadscan.run.session import Session
+from roadscan.store.manifest import recorded_rows
 from roadscan.store.schema import table_schema
 
 
@@ -75,7 +76,7 @@ class Condition(Section):
 def _sections(session: Session) -> list[dict[str, Any]]:
     location = table_schema("condition_sections").location
     records = [r for r in session.manifest.all() if r.path.startswith(f"{location}/") and r.path.endswith(".parquet")]
-    return [row for r in records for row in session.store.read_table(r.path).to_pylist()]
+    return recorded_rows(session.store, records)
 
 
 @dataclass

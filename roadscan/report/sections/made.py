@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections import Counter
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -19,14 +20,15 @@ from roadscan.core.errors import DamagedError
 from roadscan.report.blocks import Block, Paragraph, Picture, Table
 from roadscan.report.section import Material, Section
 from roadscan.run.session import Session
+from roadscan.store.digest import digest_holds
 from roadscan.store.manifest import OutputRecord, read_recorded
-from roadscan.store.store import Store
+from roadscan.store.store import MADE_AGAIN, Store
 from roadscan.tiles.product import products
 
 _EDGE: Final = 900
 """Longer edge of a small picture (pixels)."""
 _MOST_BYTES: Final = 512_000_000
-"""Largest file of an object store (bytes) that is fetched for a small picture."""
+"""Largest file (bytes) that is held against its record before a small picture is made of it, or fetched for one."""
 _MOST_OF_A_PRODUCT: Final = 4  # small pictures of a product
 _SHOWN_ELSEWHERE: Final = (ADJUSTMENT_PICTURES, CONDITION_PICTURES, RAVELLING_PICTURES, REGION_PICTURES)
 _SUFFIXES: Final = (".tif", ".png", ".jpg")
@@ -58,7 +60,9 @@ class Made(Section):
             try:
                 small = _small_picture(session.store, record)
             except (RasterioError, DamagedError, OSError, ValueError) as error:
-                yield Paragraph(f"{record.path} could not be read for a small picture: {error}", is_warning=True)
+                told = f"{record.path} could not be read for a small picture: {error}"
+                material.faults.append(told)
+                yield Paragraph(told, is_warning=True)
                 continue
             if small is not None:
                 yield Picture(small, f"{_title(record.product)}: {record.path}")
@@ -101,7 +105,10 @@ def _small_picture(store: Store, record: OutputRecord) -> bytes | None:
         picture.thumbnail((_EDGE, _EDGE))
         return _png(picture)
     if store.is_folder:
-        return _png(_reduced(store.path(record.path)))
+        path = store.path(record.path)
+        if record.digest and record.bytes <= _MOST_BYTES and not digest_holds(Path(path), record.digest):
+            raise DamagedError("the file is not as it was recorded", change=MADE_AGAIN, file=path)
+        return _png(_reduced(path))
     with MemoryFile(read_recorded(store, record)) as held:
         return _png(_reduced(held.name))
 

@@ -49,7 +49,11 @@ class Places(Section):
         )
         whole = thumbnail(site, extent_m, _WHOLE_PX)
         yield Picture(whole, "The whole survey.", link="#views=map")
-        for layer in site_layers(site)[0]:
+        layers, left_out = site_layers(site)
+        for why in left_out:
+            material.faults.append(f"not on the map: {why}")
+            yield Paragraph(f"Not on the map: {why}", is_warning=True)
+        for layer in layers:
             if layer.group in _LAYERS:
                 yield from _worst(site, layer)
 

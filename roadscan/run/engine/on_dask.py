@@ -67,7 +67,19 @@ class OnDask:
         return self._alive() if self._workers is None else self._workers
 
     def _alive(self) -> int:
-        return int(max(1, sum(self._client.nthreads().values())))
+        return int(max(1, sum(self._asked(self._client.nthreads).values())))
+
+    def _asked(self, question: Callable[[], R]) -> R:
+        """Return the scheduler's answer; it is asked again where the connection breaks meanwhile."""
+        until = time.monotonic() + _LOST_S
+        while True:
+            try:
+                return question()
+            except OSError:
+                self._check_scheduler()
+                if time.monotonic() > until:
+                    raise
+                time.sleep(_LOOK_S)  # the client notices a moment later that it is not connected
 
     def map(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Done[T, R]]:
         """Run all tasks, most of them in parallel; one is tried once more if its worker, or the scheduler, is lost.
@@ -124,7 +136,7 @@ class OnDask:
             own = [running.pop(future.key) for future in futures]
             handed_out = hand_out(handed_out)
             good = {future.key: future for future in futures if future.status == "finished"}
-            results = self._client.gather(good, errors="skip")
+            results = self._asked(functools.partial(self._client.gather, good, errors="skip"))
             batch = {future.key: task for future, task in zip(futures, own, strict=True)}
             for future, task in zip(futures, own, strict=True):
                 error = None if future.key in results else self._fault(future, function, running | batch)

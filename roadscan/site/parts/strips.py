@@ -21,7 +21,7 @@ from roadscan.site.document import Ask, Document, json_bytes
 from roadscan.site.layer import title_of
 from roadscan.site.material import Material
 from roadscan.site.part import SitePart
-from roadscan.store.manifest import OutputRecord
+from roadscan.store.manifest import OutputRecord, read_recorded
 
 _SERIES: Final = ("station_from_m", "station_to_m", "value", "sigma", "share", "reason")
 _TOLD: Final = ("from_m", "to_m", "value", "sigma", "share", "reason")
@@ -180,7 +180,7 @@ def _lanes(material: Material, first: int) -> list[Lane]:
 def _about(lane: Lane) -> dict[str, Any]:
     spans = []
     for place, record in enumerate(lane.cross_sections):
-        stations = lane.material.store.read_table(record.path, ["station_m"]).column("station_m").to_numpy()
+        stations = _column(lane, record, "station_m")
         if stations.size:
             ends = {"from_m": float(stations.min()), "to_m": float(stations.max())}
             spans.append({**ends, "url": _crossing_url(lane, place)})
@@ -195,8 +195,13 @@ def _about(lane: Lane) -> dict[str, Any]:
 
 def _first_station(lane: Lane, record: OutputRecord) -> float:
     """Return the least station of a file of values; infinite where it has none."""
-    begins = lane.material.store.read_table(record.path, ["station_from_m"]).column("station_from_m").to_numpy()
-    return float(begins.min(initial=np.inf))
+    return float(_column(lane, record, "station_from_m").min(initial=np.inf))
+
+
+def _column(lane: Lane, record: OutputRecord, name: str) -> npt.NDArray[Any]:
+    store = lane.material.store
+    column: npt.NDArray[Any] = store.parse_table(read_recorded(store, record), record.path, [name])[name].to_numpy()
+    return column
 
 
 def _piece_url(lane: Lane, name: str, part: int) -> str:

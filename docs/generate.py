@@ -28,6 +28,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from roadscan.assets.kind import AssetKind, asset_kinds
+from roadscan.assets.pictures.sign_types import listed_types
 from roadscan.core.strict import meanings
 from roadscan.core.witness import Witness, witnesses
 from roadscan.ingest.inspect.known_files import known_files
@@ -334,6 +335,15 @@ def _format_section(kind: LogFormat) -> str:
     )
 
 
+def sign_type_list(_: str) -> str:
+    """Types of signs that the recogniser knows."""
+    rows = (
+        (" ".join(f"`{code}`" for code in one["codes"]), one["name"], one["shape"], ", ".join(one["colours"]))
+        for one in listed_types()
+    )
+    return markdown_table(("code", "sign", "shape", "colours"), rows)
+
+
 def known_file_list(_: str) -> str:
     """Files that are recognised and not read, with the way out of each."""
     rows = (
@@ -501,6 +511,7 @@ DIRECTIVES: Final[dict[str, Callable[[str], str]]] = {
     "include": include,
     "asset_columns": asset_columns,
     "asset_list": asset_list,
+    "sign_types": sign_type_list,
     "distress_list": distress_list,
 }
 

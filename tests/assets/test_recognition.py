@@ -33,8 +33,9 @@ def test_a_model_gets_the_plate_upright_and_without_margin():
 
 
 def test_nothing_reads_where_nothing_is_asked_for():
-    reader = recognition_of(False, None)
-    assert reader.text(face("30")) is None and reader.label(face("30")) is None
+    reader = recognition_of(AssetPicturesSettings(sign_types="off"), None)
+    assert reader.text(face("30")) is None and reader.label([face("30")]) is None
+    assert recognition_of(AssetPicturesSettings(), None).label([face()]) == ("unknown", None)
 
 
 def model(path: Path, labels: str | None, channels: int = 3) -> Path:
@@ -63,15 +64,25 @@ def model(path: Path, labels: str | None, channels: int = 3) -> Path:
 def test_a_model_of_the_user_tells_the_type(tmp_path: Path):
     pytest.importorskip("onnxruntime")
     known = OnnxModel(model(tmp_path / "signs.onnx", "stop\ngive way\nparking"))
-    words, probability = known.label(face(colour=(230, 20, 20))) or ("", 0.0)
+    words, probability = known.label([face(colour=(230, 20, 20))]) or ("", 0.0)
     values = np.array([230, 20, 20]) / 25.5
     assert words == "stop"
     assert probability == pytest.approx(np.exp(values[0]) / np.exp(values).sum(), abs=0.02)
     empty = OnnxModel(model(tmp_path / "none.onnx", "\ngive way\nparking"))
-    assert empty.label(face(colour=(230, 20, 20))) is None
+    assert empty.label([face(colour=(230, 20, 20))]) is None
     beside = model(tmp_path / "beside.onnx", None)
     beside.with_suffix(".txt").write_text("a\nb\nc\n", encoding="utf-8")
-    assert OnnxModel(beside).label(face(colour=(20, 20, 230)))[0] == "c"  # type: ignore[index]
+    assert OnnxModel(beside).label([face(colour=(20, 20, 230))])[0] == "c"  # type: ignore[index]
+
+
+def test_the_model_of_the_user_goes_before_the_one_that_ships(tmp_path: Path):
+    pytest.importorskip("onnxruntime")
+    signs = model(tmp_path / "signs.onnx", "\ngive way\nparking")
+    reader = recognition_of(AssetPicturesSettings(recogniser=signs), signs)
+    assert reader.label([face(colour=(20, 20, 230))])[0] == "parking"  # type: ignore[index]
+    assert reader.label([face(colour=(230, 20, 20))]) == ("unknown", None)  # it has no label: the other is asked
+    blue, green = face(colour=(20, 20, 230)), face(colour=(20, 230, 20))
+    assert OnnxModel(signs).label([green, blue, blue])[0] == "parking"  # type: ignore[index]
 
 
 def test_what_is_no_recogniser_is_told(tmp_path: Path):

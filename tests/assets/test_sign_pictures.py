@@ -64,6 +64,8 @@ def test_signs_of_a_street_are_found_named_and_read(tmp_path: Path) -> None:
     assert signs["plate_height_m"].to_numpy() == pytest.approx(
         [0.75, 0.6, 0.9 * 0.866, 0.75, 0.9, 0.6, 0.6, 0.5], abs=0.05
     )
+    assert signs["type"][0] in ("vienna:B2a mutcd:R1-1", "unknown") and signs["type"][6] in ("vienna:C14-30", "unknown")
+    assert (signs["type"][[1, 2, 3, 4, 5, 7]] == "unknown").all()
     assert all(1 <= len(json.loads(named)) <= 3 for named in signs["pictures"])
     lines = geopandas.read_parquet(own.store.path("products/assets/lane_lines.parquet"))
     long = lines[lines["length_m"] > 30.0]

@@ -89,15 +89,25 @@ def model_of(judge: Judge) -> Model:
     RoadscanError
         where its file is missing or is not the one that was named.
     """
-    file = FOLDER / f"{judge.name}.json"
+    return parsed(stated_by(FOLDER / f"{judge.name}.json", judge.digest, f"the judge '{judge.name}'"))
+
+
+def stated_by(file: Path, digest: str, what: str) -> Any:
+    """Returns the content of a file of a fit.
+
+    Raises
+    ------
+    RoadscanError
+        where it is missing or has another digest than the code names.
+    """
     content = file.read_bytes() if file.is_file() else b""
     found = hashlib.sha256(content).hexdigest()[:16]
-    if found != judge.digest:
+    if found != digest:
         raise RoadscanError(
-            f"the judge '{judge.name}' is not the one that this version was made with: its file has the digest "
-            f"{found}, not {judge.digest}", expected="a whole installation: install roadscan again",
-        )  # fmt: skip
-    return parsed(json.loads(content))
+            f"{what} is not the one that this version was made with: its file has the digest {found}, not {digest}",
+            expected="a whole installation: install roadscan again",
+        )
+    return json.loads(content)
 
 
 def parsed(stated: Mapping[str, Any]) -> Model:

@@ -60,15 +60,15 @@ class ColourPlaces:
 
 
 class Recognition(ABC):
-    """Reader of the content of a cut-out. Without recognisers both methods return None."""
+    """Reader of the content of cut-outs. Without recognisers both methods return None."""
 
     @abstractmethod
     def text(self, cut_out: CutOut) -> tuple[str, float] | None:
         """Returns the text on it and the probability that it is read right."""
 
     @abstractmethod
-    def label(self, cut_out: CutOut) -> tuple[str, float] | None:
-        """Returns its type, in the words of a model, and its probability."""
+    def label(self, cut_outs: Sequence[CutOut]) -> tuple[str, float | None] | None:
+        """Returns its type, in the words of a model, and its probability, from all its cut-outs; `unknown` has none."""
 
 
 class PictureReader:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field
 
@@ -26,6 +27,9 @@ class AssetPicturesSettings(Strict):
     """How far a cut-out reaches beyond the sign on each side, as a share of its size."""
     text: bool = False
     """Read the text on signs; needs the extra `ocr` (pip install "roadscan[ocr]")."""
+    sign_types: Literal["both", "vienna", "mutcd", "off"] = "both"
+    """Tell the types of signs with the recogniser that comes with roadscan: of the set that the country has, of both
+    sets, or not at all. docs/assets.md lists the types."""
     recogniser: Path | None = None
-    """ONNX model that tells the type of a sign from its cut-out; needs the extra `onnx`. docs/assets.md says what it
-    gets and gives."""
+    """ONNX model of your own that tells the type of a sign from its cut-out; needs the extra `onnx`. It goes before the
+    recogniser that comes with roadscan. docs/assets.md says what it gets and gives."""

@@ -70,7 +70,7 @@ class _Search:
 
     def __init__(self, task: PictureTask, source: ColourSource) -> None:
         self._task, self._source = task, source
-        self._recognition = recognition_of(task.settings.text, task.recogniser)
+        self._recognition = recognition_of(task.settings, task.recogniser)
         self._screens = {square: self._read(record) for square, record in task.screens}
 
     def records(self, one: SquareObjects) -> list[OutputRecord]:

@@ -1,4 +1,4 @@
-"""Recognisers of signs: text by an OCR package, types by a user's ONNX model. Both are extras."""
+"""Recognisers of signs: text by an OCR package, types by the net that ships and by a user's ONNX model before it."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ import numpy.typing as npt
 
 from roadscan.assets.pictures.reader import CutOut, Recognition
 from roadscan.assets.pictures.settings import AssetPicturesSettings
+from roadscan.assets.pictures.sign_features import box_px
+from roadscan.assets.pictures.sign_types import sign_types
 from roadscan.core.errors import ConfigError
 from roadscan.core.extras import cv2, need, needed
 from roadscan.store.digest import file_digest
@@ -32,9 +34,10 @@ _ONE_THREAD: Final = {
 class SignRecognition(Recognition):
     """Reads text and types of signs with the recognisers that the survey asks for."""
 
-    def __init__(self, text: bool, model: Path | None) -> None:
+    def __init__(self, text: bool, model: Path | None, signs: str = "off") -> None:
         self._ocr = _ocr() if text else None
         self._model = None if model is None else OnnxModel(model)
+        self._signs = signs
 
     def text(self, cut_out: CutOut) -> tuple[str, float] | None:
         """Returns lines of text joined by blanks, with the least probability of them."""
@@ -48,9 +51,10 @@ class SignRecognition(Recognition):
         kept = [(words, score) for words, score in kept if words]
         return (" ".join(words for words, _ in kept), min(score for _, score in kept)) if kept else None
 
-    def label(self, cut_out: CutOut) -> tuple[str, float] | None:
-        """Returns the most probable label of the model."""
-        return None if self._model is None else self._model.label(cut_out)
+    def label(self, cut_outs: Sequence[CutOut]) -> tuple[str, float | None] | None:
+        """Returns the label of the user's model; where it has none, the type that the net which ships says."""
+        told = None if self._model is None else self._model.label(cut_outs)
+        return told if told is not None or self._signs == "off" else sign_types().type_of(cut_outs, self._signs)
 
 
 class OnnxModel:
@@ -93,8 +97,18 @@ class OnnxModel:
         self._labels = _labels(path, self._session)
         self._path = path
 
-    def label(self, cut_out: CutOut) -> tuple[str, float] | None:
-        """Returns the most probable label of a cut-out and its probability; None where the label is empty."""
+    def label(self, cut_outs: Sequence[CutOut]) -> tuple[str, float] | None:
+        """Returns the most probable label of a plate and its probability; None where the label is empty.
+
+        Cut-outs vote: their probabilities are averaged, each by the size of the plate in it.
+        """
+        sizes = [min(box_px(one)) for one in cut_outs]
+        values = np.average([self._probabilities(one) for one in cut_outs], axis=0, weights=sizes)
+        best = int(np.argmax(values))
+        return (self._labels[best], float(values[best])) if self._labels[best] else None
+
+    def _probabilities(self, cut_out: CutOut) -> npt.NDArray[np.float64]:
+        """Returns the probability (n,) of each label."""
         (values,) = self._session.run([self._output], {self._name: upright(cut_out, self._size)})
         values = np.asarray(values, np.float64).reshape(-1)
         if values.size != len(self._labels):
@@ -105,8 +119,7 @@ class OnnxModel:
         if values.min() < 0.0 or abs(values.sum() - 1.0) > 1e-3:
             values = np.exp(values - values.max())
             values /= values.sum()
-        best = int(np.argmax(values))
-        return (self._labels[best], float(values[best])) if self._labels[best] else None
+        return np.asarray(values)
 
 
 def upright(cut_out: CutOut, size: Sequence[int]) -> Float32:
@@ -121,9 +134,9 @@ def upright(cut_out: CutOut, size: Sequence[int]) -> Float32:
     return np.ascontiguousarray(flat.astype(np.float32).transpose(2, 0, 1)[None] / np.float32(255.0))
 
 
-def recognition_of(text: bool, model: Path | None) -> Recognition:
-    """Returns the recognisers of signs, loaded once a worker."""
-    return _recognition(text, model, "" if model is None else file_digest(model))
+def recognition_of(settings: AssetPicturesSettings, model: Path | None) -> Recognition:
+    """Returns the recognisers of signs, loaded once a worker. model : the user's, as the survey file has it."""
+    return _recognition(settings.text, model, settings.sign_types, "" if model is None else file_digest(model))
 
 
 def check_recognition(settings: AssetPicturesSettings, model: Path | None) -> None:
@@ -135,8 +148,8 @@ def check_recognition(settings: AssetPicturesSettings, model: Path | None) -> No
 
 
 @functools.lru_cache(maxsize=2)
-def _recognition(text: bool, model: Path | None, _content: str) -> Recognition:
-    return SignRecognition(text, model)
+def _recognition(text: bool, model: Path | None, signs: str, _content: str) -> Recognition:
+    return SignRecognition(text, model, signs)
 
 
 def _ocr() -> Any:

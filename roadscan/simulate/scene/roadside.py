@@ -51,6 +51,8 @@ class Sign(Standing):
     """Colour of a rim around it."""
     text: str = Field(default="", max_length=12)
     """Text on the face (ASCII)."""
+    face: str = ""
+    """File of a picture of the face (PNG, JPEG) that fills the plate's box, in place of colour, rim and text."""
 
 
 class TargetPlate(Standing):

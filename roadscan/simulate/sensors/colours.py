@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.core.errors import ConfigError
 from roadscan.core.extras import cv2
 from roadscan.simulate.caster import Hits, World
 from roadscan.simulate.kernels import things as body
@@ -120,7 +121,13 @@ def _on_face(face: _Face, place_m: Float64, shade: Float64) -> Float32:
 
 
 def _painted(sign: Sign) -> Float32:
-    """Return a face (256, 256, 3): its colour, its rim, its text."""
+    """Return a face (256, 256, 3): its picture, or its colour, its rim, its text."""
+    if sign.face:
+        shown = cv2.imread(sign.face, cv2.IMREAD_COLOR)
+        if shown is None:
+            raise ConfigError(f"the face {sign.face} of a sign cannot be read", expected="a picture", file=sign.face)
+        shown = cv2.resize(shown[:, :, ::-1], (_FACE_PX, _FACE_PX), interpolation=cv2.INTER_AREA)
+        return np.asarray(shown, np.float32) / np.float32(255.0)
     face = np.empty((_FACE_PX, _FACE_PX, 3), np.uint8)
     face[:] = _eight_bits(sign.colour)
     if sign.rim is not None:

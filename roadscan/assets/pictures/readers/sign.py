@@ -55,11 +55,13 @@ class SignReader(CutOutReader):
         colour = colour_of([_within_shape(c) for c in cut_outs])
         if colour is not None:
             told |= {"colour": colour[0], "colour_probability": colour[1]}
-        for column, found in (("message", recognition.text), ("type", recognition.label)):
-            read = [r for r in map(found, cut_outs) if r is not None]
-            if read:
-                words, probability = max(read, key=lambda r: r[1])
-                told |= {column: words, f"{column}_probability": probability}
+        read = [r for r in map(recognition.text, cut_outs) if r is not None]
+        if read:
+            words, probability = max(read, key=lambda r: r[1])
+            told |= {"message": words, "message_probability": probability}
+        kind = recognition.label(cut_outs)
+        if kind is not None:
+            told |= {"type": kind[0], "type_probability": kind[1]}
         return told
 
 

@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from benchmarks.drawn_streets import street_of_covers
 from benchmarks.hard_streets import hard_street
 from benchmarks.judgement import Segments
 from benchmarks.labelled_returns import LabelledReturns, labelled_returns
@@ -23,8 +24,9 @@ from roadscan.assets.scene import Box, Scene
 from roadscan.assets.wires.spans import features_of, spans_of
 from roadscan.assets.wires.thin import thin_cubes
 
-HARD: Final = range(40)
-"""Seeds of the streets."""
+HARD: Final = range(26)
+COVERED: Final = range(500, 512)
+"""Seeds of hard streets, and of streets with wires and covers."""
 _KNOWN: Final = (*range(10, 33), 50, 51, 70, 71, 80, 81)
 """Labels of what is no wire."""
 _AROUND_M, _STEP_M = 40.0, 10.0
@@ -37,15 +39,21 @@ _SURE: Final = 0.7
 
 def segments(folder: Path) -> Iterator[Segments]:
     """Spans of each street, as the whole drive and as a part of it sees it, and of each square of the recording."""
-    for seed in HARD:
-        seen = labelled_returns(hard_street(seed))
+    for name, seen in streets():
         wire = (seen.kind == seen.kinds.index("wire")) if "wire" in seen.kinds else np.zeros(seen.kind.size, np.bool_)
         for scene, rows in parts_of(seen):
-            yield from _of_scene(f"hard {seed}", "simulated", scene, wire[rows].astype(np.float64))
+            yield from _of_scene(name, "simulated", scene, wire[rows].astype(np.float64))
     for number, (scene, labels) in enumerate(labelled_scenes(recording_folder(), folder / "furniture-0-3", range(4))):
         yield from _of_scene(
             f"square {number}", "semantic_kitti_00", scene, np.where(np.isin(labels, _KNOWN), 0.0, 0.5)
         )
+
+
+def streets() -> Iterator[tuple[str, LabelledReturns]]:
+    """Streets by name."""
+    for name, seeds, draw in (("hard", HARD, hard_street), ("covers", COVERED, street_of_covers)):
+        for seed in seeds:
+            yield f"{name} {seed}", labelled_returns(draw(seed))
 
 
 def parts_of(seen: LabelledReturns) -> Iterator[tuple[Scene, npt.NDArray[np.int64]]]:

@@ -13,8 +13,8 @@ from roadscan.simulate.things import objects_table
 from tests.assets.streets import Street, street
 
 PLACES = [("cover", 12.0, 1.6, 0.62, 60.0), ("cover", 20.0, -1.2, 0.7, 160.0), ("cover", 28.0, 2.4, 0.6, 45.0),
-          ("cover", 40.0, 0.8, 0.75, 170.0), ("drain", 16.0, 3.2, 0.5, 30.0),
-          ("drain", 34.0, 3.2, 0.5, 25.0)]  # fmt: skip
+          ("cover", 40.0, 0.8, 0.75, 170.0), ("drain", 16.0, 3.15, 0.5, 30.0),
+          ("drain", 34.0, 3.15, 0.5, 25.0)]  # fmt: skip
 """Type, station, offset, length and shade."""
 
 
@@ -54,10 +54,11 @@ def test_covers_and_drains_are_found_with_their_type_and_size(made: StreetScene,
     for row in objects_table(made, seen.surface).to_pandas().itertuples():
         if row.kind in {"cover", "drain"}:
             away = [np.hypot(one.geometry.x - row.easting_m, one.geometry.y - row.northing_m) for one in found]
-            near = [k for k, d in enumerate(away) if d < 0.15 and found[k].attributes["type"] == row.kind]
+            near = [k for k, d in enumerate(away) if d < 0.15]
             used.update(near)
-            right += bool(near)
-            for k in near:
+            assert near
+            for k in (k for k in near if found[k].attributes["type"] == row.kind):
+                right += 1
                 size = found[k].attributes["diameter_m" if row.kind == "cover" else "length_m"]
                 assert size == pytest.approx(row.length_m, abs=0.15)
     assert right >= 5

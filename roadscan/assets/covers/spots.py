@@ -1,10 +1,10 @@
-"""Spots on the ground the size of a cover, brighter or darker than what lies around, and the features that tell them."""
+"""Spots on the ground, as large as covers, that are brighter or darker than what lies around; their features."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -49,6 +49,8 @@ _GROWS_M: Final = 0.25
 """A spot reaches so far (m) beyond its square, at most."""
 _FARTHEST_M: Final = 15.0
 """Spots are sought up to this distance (m) from a drive."""
+_RIM_M: Final = (0.02, 0.1)
+"""On both sides of a spot's edge, returns between these distances tell how sharp it is (m): patches fade."""
 _QUARTERS: Final = 4
 """Parts of a ring, each beside a part of the spot: an edge of paint is told by those that do not differ."""
 
@@ -71,6 +73,22 @@ class Spot:
     features: Mapping[str, float]
 
 
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """Returns (n,) on the ground."""
+
+    xy_m: Float64
+    """(n, 2) from the corner of the returns."""
+    height_m: Float64
+    value: Float64
+    """Contrast, of the sign of the spots that are sought."""
+    on_road: npt.NDArray[np.bool_]
+
+    def at(self, chosen: Int64 | npt.NDArray[np.bool_]) -> Ground:
+        """Returns some of them."""
+        return Ground(self.xy_m[chosen], self.height_m[chosen], self.value[chosen], self.on_road[chosen])
+
+
 def spots_of(scene: Scene) -> list[Spot]:
     """Returns the spots whose middle lies in the scene's tile, by their place."""
     contrast = paint_of(scene).contrast
@@ -80,16 +98,22 @@ def spots_of(scene: Scene) -> list[Spot]:
 
 def _of_sign(scene: Scene, contrast: Contrast, sign: float) -> list[Spot]:
     """Returns bright (1) or dark (−1) spots."""
-    found = []
     places = _squares(contrast, sign)
     if not len(places):
         return []
-    tree = cKDTree(np.column_stack([contrast.x_m, contrast.y_m]))
-    for x, y, side in places[_to_drive(scene, places[:, :2]) <= _FARTHEST_M].tolist():
-        near = np.array(tree.query_ball_point((x, y), _REACH_M + sum(_RING_M), return_sorted=True), np.int64)
-        spot = _measured(scene, contrast, sign, (x, y), side, near)
+    away = _to_drive(scene, places[:, :2])
+    places, away = places[away <= _FARTHEST_M], away[away <= _FARTHEST_M]
+    ground = Ground(
+        np.column_stack([contrast.x_m, contrast.y_m]), contrast.height_m, sign * contrast.contrast,
+        scene.classes[contrast.rows] == classes.ROAD,
+    )  # fmt: skip
+    about = cKDTree(ground.xy_m).query_ball_point(places[:, :2], _REACH_M + sum(_RING_M), return_sorted=True)
+    found = []
+    for place, to_drive, near in zip(places.tolist(), away.tolist(), about, strict=True):
+        rows = np.asarray(near, np.int64)
+        spot = _measured(ground.at(rows), contrast.rows[rows], (place[0], place[1]), place[2])
         if spot is not None and bool(scene.tile.holds(spot.x_m, spot.y_m)):
-            found.append(spot)
+            found.append(replace(spot, features={**spot.features, "sign": sign, "to_drive_m": to_drive}))
     return found
 
 
@@ -126,85 +150,84 @@ def _summed(values: npt.NDArray[np.float32], side_m: float) -> npt.NDArray[np.fl
     return np.asarray(cv2.boxFilter(values, cv2.CV_32F, (side, side), None, (-1, -1), False, cv2.BORDER_CONSTANT))
 
 
-def _measured(
-    scene: Scene, contrast: Contrast, sign: float, place: tuple[float, float], side: float, near: Int64
-) -> Spot | None:
-    """Returns the spot in a square, of the contrast's returns `near` it; None without enough of them."""
-    xy = np.column_stack([contrast.x_m, contrast.y_m])
-    inside = _grown(xy, sign * contrast.contrast, place, side, near)
-    if inside.size < _FEWEST:
+def _measured(near: Ground, rows: Int64, place: tuple[float, float], side: float) -> Spot | None:
+    """Returns the spot in a square, of the returns `near` it, `rows` of the scene; None where they are few."""
+    inside = _grown(near, place, side)
+    if np.count_nonzero(inside) < _FEWEST:
         return None
-    weight = np.clip(sign * contrast.contrast[inside], 0.02, 1.0)
-    middle = np.average(xy[inside], axis=0, weights=weight)
-    past = xy[inside] - middle
+    own = near.at(inside)
+    weight = np.clip(own.value, 0.02, 1.0)
+    middle = np.average(own.xy_m, axis=0, weights=weight)
+    past = own.xy_m - middle
     spread = (past * weight[:, None]).T @ past / weight.sum()
     values, axes = np.linalg.eigh(spread)
     values = np.maximum(values, 1e-4)
     length, width = (float(v) for v in np.sqrt(12.0 * values[::-1]))
     diameter = float(4.0 * math.sqrt(values.mean()))
-    away = np.hypot(*(xy[near] - middle).T) - diameter / 2
-    ring = near[(away >= _RING_M[0]) & (away <= _RING_M[1])]
-    if ring.size < _FEWEST:
+    away = np.hypot(*(near.xy_m - middle).T) - diameter / 2
+    ring = near.at((away >= _RING_M[0]) & (away <= _RING_M[1]))
+    if ring.value.size < _FEWEST:
         return None
-    own, beside = sign * contrast.contrast[inside], sign * contrast.contrast[ring]
-    core = near[away <= -_RING_M[0] / 2]
-    differs = _by_quarter(xy, middle, core if core.size >= _FEWEST else inside, ring, sign * contrast.contrast)
-    heights = contrast.height_m
-    plane, *_ = np.linalg.lstsq(np.column_stack([xy[ring] - middle, np.ones(ring.size)]), heights[ring], rcond=None)
-    rise = heights[inside] - (past @ plane[:2] + plane[2])
-    rough = heights[ring] - ((xy[ring] - middle) @ plane[:2] + plane[2])
-    ground = scene.classes[contrast.rows]
+    core = away <= -_RING_M[0] / 2
+    differs = _by_quarter(middle, near.at(core) if np.count_nonzero(core) >= _FEWEST else own, ring)
+    plane, *_ = np.linalg.lstsq(
+        np.column_stack([ring.xy_m - middle, np.ones(ring.value.size)]), ring.height_m, rcond=None
+    )
+    rise = own.height_m - (past @ plane[:2] + plane[2])
+    rough = ring.height_m - ((ring.xy_m - middle) @ plane[:2] + plane[2])
+    rim = _RIM_M
+    inner, outer = (near.value[(away >= a) & (away <= b)] for a, b in ((-rim[1], -rim[0]), rim))
+    step = float(own.value.mean() - ring.value.mean())
+    error = math.hypot(own.value.std() / math.sqrt(own.value.size), ring.value.std() / math.sqrt(ring.value.size))
     features = {
-        "sign": sign, "contrast": float(own.mean()), "spread": float(own.std()), "beside": float(beside.mean()),
-        "beside_spread": float(beside.std()), "least_quarter": float(np.min(differs)),
+        "contrast": float(own.value.mean()), "spread": float(own.value.std()), "beside": float(ring.value.mean()),
+        "beside_spread": float(ring.value.std()), "least_quarter": float(np.min(differs)),
         "quarters_spread": float(np.std(differs)),
-        "evidence": float((own.mean() - beside.mean()) / math.hypot(own.std() / math.sqrt(own.size),
-                                                                    beside.std() / math.sqrt(beside.size)) if
-                          own.std() + beside.std() > 0.0 else 99.0),
+        "evidence": step / max(error, 1e-3), "even": float(own.value.std() / max(ring.value.std(), 1e-3)),
+        "sharp": float((inner.mean() - outer.mean()) / max(step, 1e-3)) if inner.size and outer.size else math.nan,
         "length_m": length, "slim": length / width, "diameter_m": diameter,
-        "filled": float(inside.size / max(int(np.count_nonzero(away <= 0.0)), 1)),
-        "density": float((inside.size / diameter**2) / (ring.size / (diameter + sum(_RING_M)))),
+        "filled": own.value.size / max(int(np.count_nonzero(away <= 0.0)), 1),
+        "density": (own.value.size / diameter**2) / (ring.value.size / (diameter + sum(_RING_M))),
         "rise_m": float(np.median(rise)), "rough_m": float(np.std(rough)), "rough_inside_m": float(np.std(rise)),
-        "road": float(np.mean(ground[ring] == classes.ROAD)),
-        "road_inside": float(np.mean(ground[inside] == classes.ROAD)),
-        "to_drive_m": float(_to_drive(scene, middle[None])[0]),
+        "road": float(ring.on_road.mean()), "road_inside": float(own.on_road.mean()),
     }  # fmt: skip
     along = axes[:, 1]
     heading = math.degrees(math.atan2(along[0], along[1])) % 180.0
-    return Spot(contrast.rows[inside], float(middle[0]), float(middle[1]), length, width, diameter, heading, features)
+    return Spot(rows[inside], float(middle[0]), float(middle[1]), length, width, diameter, heading, features)
 
 
-def _grown(xy: Float64, value: Float64, place: tuple[float, float], side: float, near: Int64) -> Int64:
-    """Returns the returns that differ as those in the square do, and that hang together with it.
+def _grown(near: Ground, place: tuple[float, float], side: float) -> npt.NDArray[np.bool_]:
+    """Returns a mask (n,) of the returns that differ as those in the square do, and that hang together with it.
 
-    The value of a return is the mean over its neighbours, so that noise makes no holes. It belongs to the spot where that
-    is nearer to the square's value than to that of what lies around.
+    The value of a return is the mean over its neighbours, so that noise makes no holes. It belongs to the spot where
+    that is nearer to the square's value than to that of what lies around.
     """
-    away = np.abs(xy[near] - place).max(axis=1)
+    away = np.abs(near.xy_m - place).max(axis=1)
     core, beside = away <= side / 2, away >= side / 2 + _GAP_M
     if np.count_nonzero(core) < _FEWEST // 2 or not beside.any():
-        return np.empty(0, np.int64)
-    first, second = cKDTree(xy[near]).query_pairs(_SMOOTH_M, output_type="ndarray").T
-    own = value[near]
-    number = 1.0 + np.bincount(first, minlength=near.size) + np.bincount(second, minlength=near.size)
-    mean = own + np.bincount(first, own[second], near.size) + np.bincount(second, own[first], near.size)
+        return np.zeros(away.size, np.bool_)
+    first, second = cKDTree(near.xy_m).query_pairs(_SMOOTH_M, output_type="ndarray").T
+    own, size = near.value, away.size
+    number = 1.0 + np.bincount(first, minlength=size) + np.bincount(second, minlength=size)
+    mean = own + np.bincount(first, own[second], size) + np.bincount(second, own[first], size)
     mean /= number
     half = (np.quantile(mean[core], _CORE) + np.quantile(mean[beside], _BESIDE)) / 2
     belongs = (mean >= half) & (away <= side / 2 + _GROWS_M)
     joined = belongs[first] & belongs[second]
-    links = coo_array((np.ones(np.count_nonzero(joined)), (first[joined], second[joined])), (near.size, near.size))
+    links = coo_array((np.ones(np.count_nonzero(joined)), (first[joined], second[joined])), (size, size))
     _, label = connected_components(links, directed=False)
-    return np.asarray(near[belongs & np.isin(label, label[core & belongs])])
+    return np.asarray(belongs & np.isin(label, label[core & belongs]))
 
 
-def _by_quarter(xy: Float64, middle: Float64, inside: Int64, ring: Int64, value: Float64) -> Float64:
+def _by_quarter(middle: Float64, inside: Ground, ring: Ground) -> Float64:
     """Returns how much (4,) each quarter of a spot exceeds the part of the ring beside it; 0 where either is empty."""
     means = np.zeros((2, _QUARTERS))
     for row, own in enumerate((inside, ring)):
-        turn = np.arctan2(*(xy[own] - middle).T[::-1])
+        turn = np.arctan2(*(own.xy_m - middle).T[::-1])
         quarter = np.clip(((turn + math.pi) / (2.0 * math.pi) * _QUARTERS).astype(np.int64), 0, _QUARTERS - 1)
         number = np.bincount(quarter, minlength=_QUARTERS)
-        means[row] = np.where(number, np.bincount(quarter, value[own], _QUARTERS) / np.maximum(number, 1), np.nan)
+        sums = np.bincount(quarter, own.value, _QUARTERS)
+        means[row] = np.where(number, sums / np.maximum(number, 1), np.nan)
     return np.asarray(np.nan_to_num(means[0] - means[1]))
 
 

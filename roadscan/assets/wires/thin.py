@@ -65,8 +65,11 @@ def thin_cubes(scene: Scene) -> tuple[pa.Table, list[Int64]]:
     east, north = returns.corner_m
     xyh = np.column_stack([returns.x_m[rows], returns.y_m[rows], returns.height_m[rows]])
     cell = np.floor((xyh + np.array([east, north, 0.0])) / CUBE_M).astype(np.int64)
-    places, own, number = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
-    own = own.reshape(-1)
+    low = cell.min(axis=0) - 1 - _LEVELS.stop
+    span = cell.max(axis=0) + 2 + _LEVELS.stop - low
+    _, first, own, number = np.unique(_packed(cell, low, span), return_index=True, return_inverse=True,
+                                      return_counts=True)  # fmt: skip
+    places = cell[first]
     middle = np.column_stack([np.bincount(own, xyh[:, k]) for k in range(3)]) / number[:, None]
     tile = scene.tile
     inside = Box(tile.x_min_m - _EDGE_M, tile.y_min_m - _EDGE_M, tile.x_max_m + _EDGE_M, tile.y_max_m + _EDGE_M).holds(
@@ -101,15 +104,17 @@ def thin_cubes(scene: Scene) -> tuple[pa.Table, list[Int64]]:
     return table, held
 
 
+def _packed(cell: Int64, low: Int64, span: Int64) -> Int64:
+    """Returns one number for each cell (…, 3) of a box of `span` cells from its corner `low`."""
+    moved = cell - low
+    return np.asarray((moved[..., 0] * span[1] + moved[..., 1]) * span[2] + moved[..., 2])
+
+
 def _filled_levels(places: Int64, cubes: Int64, way: int) -> Int64:
     """Returns how many cubes (n,) hold returns in the nine columns about each, some levels below (−1) or above (1)."""
-    low = places.min(axis=0) - 1 - np.array([0, 0, _LEVELS.stop])
-    span = places.max(axis=0) + 2 + np.array([0, 0, _LEVELS.stop]) - low
-
-    def packed(cells: Int64) -> Int64:
-        moved = cells - low
-        return np.asarray((moved[..., 0] * span[1] + moved[..., 1]) * span[2] + moved[..., 2])
-
+    low = places.min(axis=0) - 1 - _LEVELS.stop
+    span = places.max(axis=0) + 2 + _LEVELS.stop - low
     steps = np.array([(i, j, way * level) for i in (-1, 0, 1) for j in (-1, 0, 1) for level in _LEVELS])
-    asked = packed(places[cubes][:, None] + steps)
-    return np.asarray(np.isin(asked, packed(places)).sum(axis=1))
+    asked, filled = _packed(places[cubes][:, None] + steps, low, span), _packed(places, low, span)
+    at = np.minimum(np.searchsorted(filled, asked), filled.size - 1)
+    return np.asarray((filled[at] == asked).sum(axis=1))

@@ -1,4 +1,4 @@
-"""The question of the judge `drain`: is what is a cover or a drain a drain? The spots of `judge_cover.py` that are either."""
+"""The question of the judge `drain`: is a spot that is a cover or a drain a drain? The spots of `judge_cover.py`."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any, Final
 
 import numpy as np
@@ -91,6 +92,47 @@ def street_of_furniture(seed: int) -> Scene:
     held = street.roadside.model_dump() | {"furniture": pieces, "signs": [], "boxes": []}
     lidar = street.lidar.model_dump() | {"model": str(random.choice(["HDL-32E", "VLP-16", "HDL-64E"]))}
     return street.changed(id=f"furniture-{seed}", roadside=held, lidar=lidar, bag={"on": True})
+
+
+def street_of_covers(seed: int) -> Scene:
+    """A drawn street with covers in its lanes, drains at its kerbs and wires over it, seen by one of four lidars."""
+    random = np.random.default_rng([seed, 43])
+    street = drawn_street(seed)
+    paved = street.road.paved_m
+
+    def between(low: float, high: float) -> float:
+        return float(random.uniform(low, high))
+
+    def wire(station: float, to_station: float, offset: float, to_offset: float, height: float) -> dict[str, float]:
+        return {"station_m": station, "to_station_m": to_station, "offset_m": offset, "to_offset_m": to_offset,
+                "height_m": height, "to_height_m": height + between(-0.5, 0.5), "sag_m": between(0.05, 0.7),
+                "diameter_m": between(0.01, 0.04)}  # fmt: skip
+
+    covers: list[dict[str, Any]] = []
+    for station in np.arange(2.0, LENGTH_M - 1.0, 3.3):
+        size = between(0.5, 0.8)
+        covers.append({"station_m": station + between(-1, 1), "offset_m": between(-paved + 0.6, paved - 0.6),
+                       "length_m": size, "width_m": size, "height_m": between(0.002, 0.006),
+                       "shade": between(30, 180)})  # fmt: skip
+    covers += [
+        {"what": "drain", "station_m": station + between(-1.2, 1.2), "shade": between(15, 70),
+         "offset_m": float(random.choice([-1.0, 1.0])) * (paved - between(0.25, 0.45)),
+         "length_m": between(0.4, 0.6), "width_m": between(0.25, 0.4)}
+        for station in np.arange(3.0, LENGTH_M - 1.0, 4.1)
+    ]  # fmt: skip
+    side, height = float(random.choice([-1.0, 1.0])), between(5.2, 8.0)
+    beside, stations = side * (paved + between(0.5, 1.5)), [between(-8, 0), between(18, 26), between(44, 52)]
+    wires = [
+        wire(start, end, beside, beside, height - 0.4 * number)
+        for start, end in itertools.pairwise(stations)
+        for number in range(int(random.integers(1, 4)))
+    ]
+    wires += [wire(s, s + between(-3, 3), beside, -side * (paved + between(1, 5)), height) for s in stations[:2]]
+    poles = [{"station_m": s, "offset_m": beside, "height_m": height + 0.3} for s in stations]
+    held = street.roadside.model_dump()
+    held |= {"covers": covers, "wires": wires, "poles": [*held["poles"], *poles]}
+    lidar = street.lidar.model_dump() | {"model": str(random.choice(["HDL-32E", "VLP-16", "HDL-64E", "OS1-128"]))}
+    return street.changed(id=f"covers-{seed}", roadside=held, lidar=lidar, bag={"on": True})
 
 
 def _large_or_small(random: np.random.Generator, station_m: float) -> dict[str, Any]:

@@ -14,6 +14,9 @@ import shapely
 
 from roadscan.assets.intensity import calibrated_scene, gains_of, intensity_sample
 from roadscan.assets.kind import AssetObject, Evidence, asset_kinds
+from roadscan.assets.paint.components import Component
+from roadscan.assets.paint.contrast import Contrast
+from roadscan.assets.paint.stripes import stripes_of
 from roadscan.assets.scene import Box, Scene
 from roadscan.simulate.scene import Scene as SimulatedScene
 from tests.assets.scenes import NOT_JUDGED, semantic_kitti_scene
@@ -180,3 +183,23 @@ def half_of(scene: Scene, x_min_m: float, x_max_m: float) -> Scene:
         scene, returns=scene.returns.at(rows), tile=tile, window=window,
         above_ground_m=scene.above_ground_m[rows], classes=scene.classes[rows],
     )  # fmt: skip
+
+
+def test_a_wide_patch_that_lies_askew_within_one_cut_is_no_band_and_ends() -> None:
+    """Its diagonal is longer than a band in one piece may be, and no cut of the map crosses it."""
+    x, y = (v.ravel() for v in np.meshgrid(np.arange(0.025, 5.0, 0.05), np.arange(0.025, 6.0, 0.05)))
+    patch = np.abs(x * 0.7593 - y * 0.6508) < 0.6  # 1.2 m wide, along the diagonal
+    x, y = x[patch], y[patch]
+    every = np.arange(x.size)
+    box = Box(0.0, 0.0, 10.0, 10.0)
+    ground = Contrast(
+        every, x, y, np.zeros(x.size), np.ones(x.size), np.full(x.size, 0.1), every // 50, every, box,
+        np.zeros((200, 200), np.float32), np.full((200, 200), np.inf, np.float32),
+    )  # fmt: skip
+    whole = Component(every, x, y, every, np.ones(x.size, np.bool_), 9.0)
+
+    class NoRoad:
+        def at(self, x_m: float, y_m: float) -> float:
+            return float("nan")
+
+    assert not stripes_of(ground, whole, (0.0, 0.0), NoRoad())  # type: ignore[arg-type]

@@ -312,12 +312,11 @@ def _of_parts(
     """Stripes of the pieces of a component, cut at multiples of `CHUNK_M` in the map, or halved where it is short."""
     middle, along, length = axis
     x, y = found.x_m[component.near], found.y_m[component.near]
-    if length > _LONGEST_WHOLE_M:
-        east = abs(along[0]) >= abs(along[1])
-        corner = corner_m[0] if east else corner_m[1]
-        of_cells = np.floor((corner + (component.cell_x_m if east else component.cell_y_m)) / CHUNK_M)
-        of_returns = np.floor((corner + (x if east else y)) / CHUNK_M)
-    else:
+    east = abs(along[0]) >= abs(along[1])
+    corner = corner_m[0] if east else corner_m[1]
+    of_cells = np.floor((corner + (component.cell_x_m if east else component.cell_y_m)) / CHUNK_M)
+    of_returns = np.floor((corner + (x if east else y)) / CHUNK_M)
+    if length <= _LONGEST_WHOLE_M or of_cells.min() == of_cells.max():  # a wide one may lie askew between two cuts
         of_cells = (
             (component.cell_x_m - middle[0]) * along[0] + (component.cell_y_m - middle[1]) * along[1] >= 0
         ).astype(np.float64)

@@ -266,11 +266,24 @@ def load_ranges(
     slices = _in_order(plan)
     if not manifest.of(PRODUCT):
         raise StoreError("the survey has no footprints", change="run `roadscan footprints` first")
-    wanted = None if window is None else _in_window(window)
     whole = manifest.get(JOINED, _ALL) if files is None and window is None else None
     if whole is not None and whole.key == _key_of_joined(slices, manifest):
         rows = plan.store.parse_table(read_recorded(plan.store, whole), whole.path)
-        return _ranges_of(rows, slices)
+    else:
+        rows = _rows_of(plan, manifest, slices, files, window)
+    column = {name: rows.column(name).to_numpy() for name in _LOADED}
+    return FootprintRanges(**column, slice_index=rows.column(_NUMBER).to_numpy(), slices=tuple(slices))
+
+
+def _rows_of(
+    plan: SurveyPlan,
+    manifest: Manifest,
+    slices: Sequence[RawSlice],
+    files: Collection[str] | None = None,
+    window: Window | None = None,
+) -> pa.Table:
+    """Return the footprints of some data files in some tiles, with the number of each row's file among `slices`."""
+    wanted = None if window is None else _in_window(window)
     tables: list[pa.Table] = [_JOINED_ROWS.empty_table()]
     for number, one in enumerate(slices):
         record = manifest.get(PRODUCT, one.file)
@@ -281,7 +294,7 @@ def load_ranges(
             table = table.filter(wanted)
         numbers = pa.array(np.full(table.num_rows, number, np.int32))
         tables.append(table.append_column(_NUMBER, numbers).cast(_JOINED_ROWS))
-    return _ranges_of(pa.concat_tables(tables), slices)
+    return pa.concat_tables(tables).combine_chunks()
 
 
 def join_footprints(plan: SurveyPlan, manifest: Manifest) -> None:
@@ -292,9 +305,7 @@ def join_footprints(plan: SurveyPlan, manifest: Manifest) -> None:
     key = _key_of_joined(slices, manifest)
     if not manifest.of(PRODUCT) or manifest.is_current(JOINED, _ALL, key):
         return
-    found = load_ranges(plan, manifest)
-    columns = {name: getattr(found, name) for name in _LOADED} | {_NUMBER: found.slice_index}
-    content = sealed_parquet(pa.table(columns, schema=_JOINED_ROWS), compression="zstd")
+    content = sealed_parquet(_rows_of(plan, manifest, slices), compression="zstd")
     plan.store.write_bytes(_JOINED_FILE, content, lasting=False)
     manifest.add([OutputRecord(JOINED, _ALL, key, _JOINED_FILE, len(content), bytes_digest(content))])
 
@@ -310,11 +321,6 @@ def _key_of_joined(slices: Sequence[RawSlice], manifest: Manifest) -> str:
     """Return the key of the file with all footprints: the data files in their order, and the footprints of each."""
     known = ((one.file, manifest.get(PRODUCT, one.file)) for one in slices)
     return key_of(_LOADED, [(file, record and record.digest) for file, record in known])
-
-
-def _ranges_of(rows: pa.Table, slices: Sequence[RawSlice]) -> FootprintRanges:
-    column = {name: rows.column(name).to_numpy() for name in _LOADED}
-    return FootprintRanges(**column, slice_index=rows.column(_NUMBER).to_numpy(), slices=tuple(slices))
 
 
 def _in_window(window: Window) -> pc.Expression:

@@ -11,9 +11,9 @@ from scipy.spatial import cKDTree
 
 from roadscan.assets import classes
 from roadscan.assets.bins import in_bins
-from roadscan.assets.kernels.lines_through import lines_through
 from roadscan.assets.scene import Box, Scene
 from roadscan.assets.upright.pieces import seen_by
+from roadscan.assets.wires.kernels.lines_through import lines_through
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

@@ -34,19 +34,22 @@ class LocalBytes:
 
 
 class RemoteBytes:
-    """An object of any fsspec file system. Announced bytes that are not read yet stay in memory."""
+    """An object of any fsspec file system. Announced bytes that are not read yet stay in memory.
 
-    def __init__(self, store: Store, path: str) -> None:
-        self.stream: Any = store.fs.open(path, "rb")
+    An object that is known to be small is in memory from the beginning.
+    """
+
+    def __init__(self, store: Store, file: str) -> None:
+        self.stream: Any = store.opened(file)
         weakref.finalize(self, self.stream.close)
-        self._fetch = functools.partial(store.fs.cat_file, path)
+        self._fetch = functools.partial(store.fs.cat_file, store.path(file))
         self._ahead: ReadAhead[bytes] = ReadAhead()
         self._expected: list[tuple[int, int]] = []
         self._start, self._held = 0, b""
 
     def expect(self, start: int, end: int) -> None:
         """Start to fetch bytes `start` to `end` in one request."""
-        if (start, end) not in self._expected:
+        if (start, end) not in self._expected and not isinstance(self.stream, io.BytesIO):
             self._expected.append((start, end))
             self._ahead.begin((start, end), functools.partial(self._fetch, start=start, end=end))
 
@@ -64,9 +67,9 @@ class RemoteBytes:
         return True
 
 
-def opened(store: Store, path: str) -> LocalBytes | RemoteBytes:
-    """Open a file of a store by its full path."""
-    return LocalBytes(path) if store.is_folder else RemoteBytes(store, path)
+def opened(store: Store, file: str) -> LocalBytes | RemoteBytes:
+    """Open a file of a store by its path in it."""
+    return LocalBytes(store.path(file)) if store.is_folder else RemoteBytes(store, file)
 
 
 def _filled(stream: Any, start: int, room: memoryview) -> bool:

@@ -25,7 +25,7 @@ Pages = TypeVar("Pages", bound=PageFile)
 
 def opened_footer(store: Store, file: str) -> Footer:
     """Open a file of the store and read its footer; raises what `store.damage.UNREADABLE` names."""
-    source = opened(store, store.path(file))
+    source = opened(store, file)
     return source, *read_footer(source.stream)
 
 

@@ -1,0 +1,1 @@
+"""Kernels of lines through cubes of returns."""

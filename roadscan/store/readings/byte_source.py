@@ -49,7 +49,7 @@ class RemoteBytes:
 
     def expect(self, start: int, end: int) -> None:
         """Start to fetch bytes `start` to `end` in one request."""
-        if (start, end) not in self._expected and not isinstance(self.stream, io.BytesIO):
+        if (start, end) not in self._expected and type(self.stream) is not io.BytesIO:
             self._expected.append((start, end))
             self._ahead.begin((start, end), functools.partial(self._fetch, start=start, end=end))
 

@@ -27,7 +27,7 @@ from roadscan.tiles.product import ProductContext, Tile
 from roadscan.tiles.products.geotiff import GeoTiff, GeoTiffOptions
 from roadscan.tiles.products.raster import CellBox, cell_image
 from roadscan.tiles.pyramid import overview_factors, pyramid_of
-from roadscan.tiles.tasks.cell_files import cells_table, overviews_table, write_cells, write_overviews
+from roadscan.tiles.tasks.cell_files import write_cells, write_overviews
 
 READINGS_A_CELL = 25
 EDGE = 2000
@@ -61,16 +61,20 @@ def figures(folder: Path) -> Iterator[Figure]:
             f"rasterio {name}",
         )
     for columns in ("surface", "full"):
+        write_cells(path, cells, columns)
+        rows = pq.read_table(path)
         yield figure(
             f"table of cells, {columns}",
             lambda columns=columns: write_cells(path, cells, columns),
-            lambda columns=columns: pq.write_table(cells_table(cells, columns), path, compression="zstd"),
+            lambda rows=rows: pq.write_table(rows, path, compression="zstd"),
             "pyarrow's defaults with zstd",
         )
+    write_overviews(path, levels)
+    rows = pq.read_table(path)
     yield figure(
         "table of overviews",
         lambda: write_overviews(path, levels),
-        lambda: pq.write_table(overviews_table(levels), path, compression="zstd"),
+        lambda: pq.write_table(rows, path, compression="zstd"),
         "pyarrow's defaults with zstd",
     )
     small, context = lane(200), context_of(200)

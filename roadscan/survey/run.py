@@ -93,9 +93,12 @@ def _tell_upgrade(session: Session) -> None:
     if store.exists("manifest/logs"):
         due = survey_status(Session(session.survey, store, only_looks=True)).due
         made = ", ".join(f"{count:,} of {stage}" for stage, count in due.items()) or "nothing"
+        by = f"roadscan {last}" if last else "an older version"
+        if not last and store.exists(VERSION_FILE):
+            by = f"a version that is not known, because {VERSION_FILE} is damaged and is written anew"
         session.note(
-            f"the store was written by {f'roadscan {last}' if last else 'an older version'}, this is roadscan "
-            f"{__version__}; to be made anew, as far as is known before: {made}"
+            f"the store was written by {by}, this is roadscan {__version__}; to be made anew, as far as is known "
+            f"before: {made}"
         )
     store.write_bytes(VERSION_FILE, version_content())
 

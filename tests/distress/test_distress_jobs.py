@@ -80,15 +80,17 @@ def test_the_code_that_joins_pieces_belongs_to_the_keys_of_their_tables():
     assert not [m for m in reached_code([name_of(type(product_named("tile_table")))]) if "surfaces" in m]
 
 
-def test_pieces_of_tiles_without_a_reading_are_joined_as_well():
+def test_pieces_of_tiles_without_a_reading_are_joined_as_well(monkeypatch):
     context = ProductContext("s", "", MapFrame(None, "yard"), TileGrid(), (), DAY)
     own, bridged = TileId(3, 4), TileId(2, 4)
     files = [OutputRecord("pothole_pieces", str(t), "key", f"{t}.parquet", 6, "digest") for t in (own, bridged)]
     product = product_named("potholes")
-    plan, summaries = SimpleNamespace(store=None), {own: SimpleNamespace(tile=own)}
-    (task,) = products._tasks(product, product.options(), plan, context, {}, {}, summaries, files)
-    assert task.output.tiles == (bridged, own)
-    assert {r.unit for r in task.files} == {"2_4", "3_4"}
+    found = SimpleNamespace(summaries={own: SimpleNamespace(tile=own)}, contents={})
+    monkeypatch.setattr(products, "tile_figures", lambda manifest: found)
+    manifest = SimpleNamespace(of=lambda name: {r.unit: r for r in files if r.product == name})
+    (planned,) = products._planned(product, product.options(), SimpleNamespace(store=None), context, manifest)
+    assert planned.output.tiles == (bridged, own)
+    assert {r.unit for r in planned.read} == {"2_4", "3_4"}
 
 
 def test_lanes_run_as_the_vehicle_drove(finished):

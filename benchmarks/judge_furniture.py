@@ -17,12 +17,10 @@ import numpy.typing as npt
 from benchmarks.drawn_streets import drawn_street, street_of_furniture
 from benchmarks.hard_streets import hard_street
 from benchmarks.judgement import Segments
-from benchmarks.labelled_returns import LabelledReturns, labelled_returns
+from benchmarks.labelled_returns import LabelledReturns, labelled_returns, scene_about
 from benchmarks.labelled_scenes import labelled_scenes
 from benchmarks.labelled_street import recording_folder
 from roadscan.assets.furniture.compact import Compact, compact_things
-from roadscan.assets.make_scene import make_scene
-from roadscan.assets.scene import Box
 from roadscan.simulate import Scene as Street
 
 TYPES: Final = ("cabinet", "bin", "bench", "hydrant", "bus_shelter")
@@ -35,8 +33,6 @@ FURNISHED: Final = range(400, 416)
 """Seeds of plain streets with much furniture."""
 _NO_FURNITURE: Final = (*range(10, 33), 50, 51, 70, 71, 80, 81)
 """Labels of vehicles, people, buildings, fences, vegetation, trunks, poles and signs."""
-_AROUND_M, _STEP_M = 40.0, 10.0
-"""Margin around a drive, and the step of the square's corners (m)."""
 _PART_S, _PARTS = 2.0, 3
 """Duration (s) and number of the parts of a drive that are also shown by themselves."""
 _SURE: Final = 0.7
@@ -72,18 +68,10 @@ def of_street(name: str, street: Street) -> Iterator[Segments]:
 
 
 def _of_part(name: str, seen: LabelledReturns, rows: npt.NDArray[np.int64]) -> Iterator[Segments]:
-    own = seen.returns.at(rows)
-    way = np.column_stack([own.sensor_x_m, own.sensor_y_m])
-    corners = np.concatenate([np.floor((way.min(axis=0) - _AROUND_M) / _STEP_M),
-                              np.ceil((way.max(axis=0) + _AROUND_M) / _STEP_M)]) * _STEP_M  # fmt: skip
-    box = Box(*corners.tolist())
-    kept = np.flatnonzero(box.holds(own.x_m, own.y_m))
-    drive = seen.drive_xyh_m
-    passed = ((drive[:, :2] > way.min(axis=0) - 1.0) & (drive[:, :2] < way.max(axis=0) + 1.0)).all(axis=1)
-    scene = make_scene(own.at(kept), box, box, drive[passed])
+    scene, kept = scene_about(seen, rows)
     found, types = [], []
     for one in compact_things(scene):
-        kinds = seen.kind[rows[kept[one.rows]]]
+        kinds = seen.kind[kept[one.rows]]
         most = int(np.bincount(kinds).argmax())
         share, kind = float(np.mean(kinds == most)), seen.kinds[most]
         kind = _TYPE.get(kind, kind)

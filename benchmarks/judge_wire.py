@@ -16,21 +16,18 @@ import numpy.typing as npt
 from benchmarks.drawn_streets import street_of_covers
 from benchmarks.hard_streets import hard_street
 from benchmarks.judgement import Segments
-from benchmarks.labelled_returns import LabelledReturns, labelled_returns
+from benchmarks.labelled_returns import LabelledReturns, labelled_returns, scene_about
 from benchmarks.labelled_scenes import labelled_scenes
 from benchmarks.labelled_street import recording_folder
-from roadscan.assets.make_scene import make_scene
-from roadscan.assets.scene import Box, Scene
+from roadscan.assets.scene import Scene
 from roadscan.assets.wires.spans import features_of, spans_of
 from roadscan.assets.wires.thin import thin_cubes
 
 HARD: Final = range(26)
-COVERED: Final = range(500, 512)
+COVERED: Final = range(500, 516)
 """Seeds of hard streets, and of streets with wires and covers."""
 _KNOWN: Final = (*range(10, 33), 50, 51, 70, 71, 80, 81)
 """Labels of what is no wire."""
-_AROUND_M, _STEP_M = 40.0, 10.0
-"""Margin around a drive, and the step of the square's corners (m)."""
 _PART_S: Final = 1.5
 """Duration of the part of a drive that is also shown by itself (s)."""
 _SURE: Final = 0.7
@@ -62,17 +59,8 @@ def parts_of(seen: LabelledReturns) -> Iterator[tuple[Scene, npt.NDArray[np.int6
     first, last = int(epochs.min()), int(epochs.max()) + 1
     for begin in (first, (first + last) // 2):
         rows = np.flatnonzero((epochs >= begin) & (epochs < (last if begin == first else begin + int(_PART_S * 1e9))))
-        if not rows.size:
-            continue
-        own = seen.returns.at(rows)
-        way = np.column_stack([own.sensor_x_m, own.sensor_y_m])
-        corners = np.concatenate([np.floor((way.min(axis=0) - _AROUND_M) / _STEP_M),
-                                  np.ceil((way.max(axis=0) + _AROUND_M) / _STEP_M)]) * _STEP_M  # fmt: skip
-        box = Box(*corners.tolist())
-        kept = np.flatnonzero(box.holds(own.x_m, own.y_m))
-        drive = seen.drive_xyh_m
-        passed = ((drive[:, :2] > way.min(axis=0) - 1.0) & (drive[:, :2] < way.max(axis=0) + 1.0)).all(axis=1)
-        yield make_scene(own.at(kept), box, box, drive[passed]), rows[kept]
+        if rows.size:
+            yield scene_about(seen, rows)
 
 
 def _of_scene(group: str, source: str, scene: Scene, wire: npt.NDArray[np.float64]) -> Iterator[Segments]:

@@ -24,7 +24,10 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
+from roadscan.assets.make_scene import make_scene
 from roadscan.assets.returns import Returns
+from roadscan.assets.scene import Box
+from roadscan.assets.scene import Scene as AssetScene
 from roadscan.simulate import Scene
 from roadscan.simulate.caster import World
 from roadscan.simulate.drive import Drive, Poses, drives_of
@@ -44,6 +47,8 @@ Int64 = npt.NDArray[np.int64]
 
 _DRIVE_STEP: Final = 2_000
 """Returns from one place of the sensor in `drive_xyh_m` to the next, at least."""
+_AROUND_M, _STEP_M = 40.0, 10.0
+"""Margin around a drive, and the step of the corners of its square (m)."""
 _REACH_M: Final = 150.0
 """Distance from the middle of a street within which its map is one quadratic polynomial (m): good to 1 µm."""
 
@@ -99,6 +104,19 @@ def labelled_returns(scene: Scene, *, laser_numbers: bool = True) -> LabelledRet
         (label["met"] - [*corner, 0.0]).astype(np.float32), kinds, objects_table(scene, surface).to_pandas(),
         _ways(returns), surface, world,
     )  # fmt: skip
+
+
+def scene_about(seen: LabelledReturns, rows: npt.NDArray[np.int64]) -> tuple[AssetScene, npt.NDArray[np.int64]]:
+    """The scene of some returns of a street, of the square about where they were seen from, and the rows in it."""
+    own = seen.returns.at(rows)
+    way = np.column_stack([own.sensor_x_m, own.sensor_y_m])
+    corners = np.concatenate([np.floor((way.min(axis=0) - _AROUND_M) / _STEP_M),
+                              np.ceil((way.max(axis=0) + _AROUND_M) / _STEP_M)]) * _STEP_M  # fmt: skip
+    box = Box(*corners.tolist())
+    kept = np.flatnonzero(box.holds(own.x_m, own.y_m))
+    drive = seen.drive_xyh_m
+    passed = ((drive[:, :2] > way.min(axis=0) - 1.0) & (drive[:, :2] < way.max(axis=0) + 1.0)).all(axis=1)
+    return make_scene(own.at(kept), box, box, drive[passed]), rows[kept]
 
 
 # --- places ------------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from roadscan.footprints.reach import group_spans, opened, touched_tiles
 from roadscan.georeference.place import FATE_NAMES, Window
 from roadscan.georeference.plan.plan import SurveyPlan, plan_of
 from roadscan.georeference.reach import Touched, joined
-from roadscan.georeference.reading_counts import fate_words, reading_counts
+from roadscan.georeference.reading_counts import LogCounts, fate_words
 from roadscan.georeference.sources import Georeferencer, MapSettings, RawSlice
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.bundles import cut_bundles, run_bundles
@@ -30,7 +30,7 @@ from roadscan.run.engine.fingerprint import key_of
 from roadscan.run.session import Session, found_once
 from roadscan.run.stage import StageState
 from roadscan.store.digest import bytes_digest
-from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.store.seal import sealed_parquet
 from roadscan.store.store import Store
@@ -47,7 +47,7 @@ _LOADED: Final = [
     "tile_column", "tile_row", "first_group", "last_group", "readings", "first_epoch_gps_ns", "last_epoch_gps_ns",
 ]  # fmt: skip
 _NUMBER: Final = "slice_index"
-JOINED = "footprints_joined"
+JOINED: Final = f"{PRODUCT}.joined"
 """Manifest name of the file with the footprints of all data files."""
 _ALL: Final = "all"
 _JOINED_FILE: Final = "manifest/footprints/all.parquet"
@@ -138,7 +138,7 @@ def unplaced_logs(plan: SurveyPlan, manifest: Manifest) -> list[tuple[str, str]]
         figures = [record.figures() for record in records if record is not None]
         if len(figures) < len(files) or any("window" in one for one in figures):
             continue
-        fates = reading_counts(record for record in records if record is not None)
+        fates = LogCounts(record for record in records if record is not None).of_all()
         found.append(
             (
                 paths[files[0].path],
@@ -268,7 +268,7 @@ def load_ranges(
         raise StoreError("the survey has no footprints", change="run `roadscan footprints` first")
     whole = manifest.get(JOINED, _ALL) if files is None and window is None else None
     if whole is not None and whole.key == _key_of_joined(slices, manifest):
-        rows = plan.store.parse_table(read_recorded(plan.store, whole), whole.path)
+        rows = recorded_table(plan.store, whole)
     else:
         rows = _rows_of(plan, manifest, slices, files, window)
     column = {name: rows.column(name).to_numpy() for name in _LOADED}
@@ -289,7 +289,7 @@ def _rows_of(
         record = manifest.get(PRODUCT, one.file)
         if record is None or (files is not None and one.file not in files) or _is_apart(record, window):
             continue
-        table = plan.store.parse_table(read_recorded(plan.store, record), record.path, _LOADED)
+        table = recorded_table(plan.store, record, _LOADED)
         if wanted is not None:
             table = table.filter(wanted)
         numbers = pa.array(np.full(table.num_rows, number, np.int32))

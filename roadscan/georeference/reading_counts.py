@@ -68,8 +68,7 @@ class LogCounts:
         """Return the sums of both."""
         both = LogCounts()
         for one in (self, other):
-            for log, fates in one.by_log().items():
-                both.add("", {log: fates})
+            both.add("", one.by_log())
         return both
 
     def by_log(self) -> dict[str, dict[str, int]]:
@@ -79,26 +78,8 @@ class LogCounts:
 
     def of_all(self) -> dict[str, int]:
         """Return the counts of all logs together."""
-        return of_all(self.by_log())
-
-
-def counts_by_log(records: Iterable[OutputRecord]) -> dict[str, dict[str, int]]:
-    """Sum readings by outcome over the records of tiles and footprints, by the key of their log."""
-    return LogCounts(records).by_log()
-
-
-def reading_counts(records: Iterable[OutputRecord]) -> dict[str, int]:
-    """Sum readings by outcome over all records."""
-    return of_all(counts_by_log(records))
-
-
-def of_all(logs: Mapping[str, Mapping[str, int]]) -> dict[str, int]:
-    """Sum readings by outcome over all logs."""
-    totals = dict.fromkeys(FATE_NAMES, 0)
-    for fates in logs.values():
-        for name, count in fates.items():
-            totals[name] += count
-    return {name: count for name, count in totals.items() if count}
+        totals = {name: sum(own[name] for own in self._logs.values()) for name in FATE_NAMES}
+        return {name: count for name, count in totals.items() if count}
 
 
 FATE_WORDS: Final = {

@@ -29,7 +29,7 @@ from roadscan.run.session import Session
 from roadscan.store.asset_schema import asset_kind_names, asset_schema
 from roadscan.store.asset_truth import COMMITS, AssetTruth
 from roadscan.store.digest import bytes_digest
-from roadscan.store.manifest import read_recorded
+from roadscan.store.manifest import read_recorded, recorded_table
 from roadscan.store.store import Store
 
 FOUND: Final = "products/assets"
@@ -160,7 +160,7 @@ def _visibility(session: Session) -> Visibility:
 
     def cells(square: TileId) -> pa.Table | None:
         record = records.get(str(square))
-        return store.parse_table(read_recorded(store, record), record.path) if record and record.path else None
+        return recorded_table(store, record) if record and record.path else None
 
     return VisibilityOfSquares(asset_grid(session.survey, config).edge_m, cells)
 

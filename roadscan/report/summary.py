@@ -21,12 +21,12 @@ from roadscan.core.errors import StoreError
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
 from roadscan.footprints.footprints import PRODUCT as FOOTPRINTS
-from roadscan.georeference.reading_counts import reading_counts
 from roadscan.navigation.tasks.navigate import known_keys
 from roadscan.run.stage import findings_of
 from roadscan.store.logs import LogRecord, read_log_records
 from roadscan.store.manifest import Manifest, OutputRecord, read_failures
 from roadscan.store.store import Store
+from roadscan.tiles.tasks.tile_figures import reading_counts
 from roadscan.tiles.tasks.tile_plan import TILE
 
 
@@ -120,7 +120,7 @@ def survey_summary(survey: Survey, store: Store) -> SurveySummary:
         survey=survey.config.id,
         store=store.root,
         logs=_logs(logs),
-        readings=reading_counts([*manifest.of(FOOTPRINTS).values(), *tiles]),
+        readings=reading_counts(manifest).of_all(),
         tiles=_tiles(tiles, survey.config.tiles.cell_m) if tiles else None,
         adjustment=known_lines(manifest),
         findings=findings_of(survey, logs, manifest),

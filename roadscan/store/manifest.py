@@ -366,10 +366,15 @@ def read_recorded(store: Store, record: OutputRecord) -> bytes:
     return content
 
 
+def recorded_table(store: Store, record: OutputRecord, columns: Sequence[str] | None = None) -> pa.Table:
+    """Return an output that is a Parquet file, or some of its columns, verified as by :func:`read_recorded`."""
+    return store.parse_table(read_recorded(store, record), record.path, columns)
+
+
 def recorded_rows(store: Store, records: Iterable[OutputRecord]) -> list[dict[str, Any]]:
     """Return the rows of outputs that are Parquet files, each verified as by :func:`read_recorded`."""
     held = (record for record in records if record.path)
-    return [row for r in held for row in store.parse_table(read_recorded(store, r), r.path).to_pylist()]
+    return [row for r in held for row in recorded_table(store, r).to_pylist()]
 
 
 def is_changing(store: Store) -> bool:

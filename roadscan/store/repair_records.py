@@ -30,33 +30,31 @@ def repair_records(store: Store, report: Report = lambda _: None) -> None:
     _mend_manifest(store, report)
 
 
-def fault_of(store: Store, folder: Path, path: str, size: int, digest: str) -> str | None:
-    """Return what is wrong with a recorded file, None for nothing. `folder` is for copies of remote files."""
-    if (fault := size_fault(store, path, size)) is not None:
-        return fault
-    try:
-        with store.copied(path, folder) as local:
-            return digest_fault(local, path, digest)
-    except OSError as error:
-        return unread_fault(path, error)
+def fault_of(
+    store: Store,
+    folder: Path,
+    path: str,
+    size: int,
+    digest: str,
+    also: Callable[[Path], str | None] = lambda _: None,
+) -> str | None:
+    """Return what is wrong with a recorded file, None for nothing.
 
-
-def size_fault(store: Store, path: str, size: int) -> str | None:
-    """Return what is wrong with a recorded file by its size alone."""
+    Parameters
+    ----------
+    folder : for copies of remote files.
+    also : says what else is wrong with a file whose bytes are as recorded, from a local copy of it.
+    """
     found = store.size(path)
     if found is None:
         return f"{path}: missing"
-    return None if found == size else f"{path}: {found} bytes, expected {size}"
-
-
-def digest_fault(local: Path, path: str, digest: str) -> str | None:
-    """Return what is wrong with a recorded file, of which `local` is a copy, by its content."""
-    return None if digest_holds(local, digest) else f"{path}: the content has changed (digest differs)"
-
-
-def unread_fault(path: str, error: OSError) -> str:
-    """Return that a file cannot be read, and why."""
-    return f"{path}: it cannot be read: {error.strerror or error}"
+    if found != size:
+        return f"{path}: {found} bytes, expected {size}"
+    try:
+        with store.copied(path, folder) as local:
+            return also(local) if digest_holds(local, digest) else f"{path}: the content has changed (digest differs)"
+    except OSError as error:
+        return f"{path}: it cannot be read: {error.strerror or error}"
 
 
 def _mend_logs(store: Store, report: Report) -> None:

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import io
 import os
 import shutil
 import tempfile
@@ -188,13 +187,11 @@ class Store:
             look.keep(relative, content)
         return content
 
-    def opened(self, relative: str) -> Any:
-        """Return a file as a stream of bytes; an object whose size is known to be small comes by one request."""
+    def is_small(self, relative: str) -> bool:
+        """Return whether an object is known to be small enough for one request and for memory."""
         look = self._look()
         size = None if look is None else look.size(relative)
-        if size is not None and size <= _AT_ONCE_BYTES:
-            return io.BytesIO(self.read_bytes(relative))
-        return self.fs.open(self.path(relative), "rb")
+        return size is not None and size <= _AT_ONCE_BYTES
 
     def read_table(self, relative: str, columns: Sequence[str] | None = None, change: str = MADE_AGAIN) -> pa.Table:
         """Return a small Parquet file, its seal and its page checksums verified; `change` says how to repair it.

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import pyarrow.parquet as pq
 
 from roadscan.core.errors import DamagedError, RoadscanError, StoreError
 from roadscan.core.witness import Finding
-from roadscan.footprints.footprints import JOINED, PRODUCT
+from roadscan.footprints.footprints import PRODUCT
 from roadscan.georeference.plan.plan import NothingToPlaceError
-from roadscan.georeference.reading_counts import LogCounts
 from roadscan.ingest.overlap import NothingPlacedError
 from roadscan.ingest.planned_logs import PlannedLog, UnplannedLog, logs_of
 from roadscan.ingest.sources import damaged_sources
@@ -25,7 +25,7 @@ from roadscan.store.damage import UNREADABLE
 from roadscan.store.history import history_faults
 from roadscan.store.logs import LogRecord, copy_path, has_log, read_log_records, record_path
 from roadscan.store.manifest import Manifest, OutputRecord, read_failures
-from roadscan.store.repair_records import digest_fault, fault_of, size_fault, unread_fault
+from roadscan.store.repair_records import fault_of
 from roadscan.store.salvage import Lost, read_lost
 from roadscan.store.stamp import Stamp, stamp_of
 from roadscan.store.store import Store
@@ -34,10 +34,7 @@ from roadscan.store.written_by import VERSION_FILE
 from roadscan.survey.forgotten import forgotten_pictures
 from roadscan.survey.preflight import preflight
 from roadscan.tiles.product import products
-from roadscan.tiles.tasks.tile_figures import tile_figures
-
-_UNSHOWN: Final = (PRODUCT, JOINED)
-"""Products that are no file that somebody asked for."""
+from roadscan.tiles.tasks.tile_figures import reading_counts
 
 
 @dataclass
@@ -142,11 +139,12 @@ def _survey_status(session: Session) -> Status:
     status.logs += [_unplanned_state(one) for one in unplanned]
     keys = {*(log.key for log in planned), *known_keys(session.survey, store, logs_of(session))}
     status.unused_logs = [f"{r.run}/{r.sensor} {r.path}" for r in records.values() if r.key not in keys]
-    status.outputs = {product: count for product, count in manifest.files().items() if product not in _UNSHOWN}
+    shown = ((product, count) for product, count in manifest.files().items() if product.split(".")[0] != PRODUCT)
+    status.outputs = dict(shown)
     files = (one for r in records.values() if r.key in keys for one in r.tables.items())
     for table, own in files:
         status.ingested[table] = status.ingested.get(table, 0) + len(own)
-    status.readings = (LogCounts(manifest.of(PRODUCT).values()) + tile_figures(manifest).counts).of_all()
+    status.readings = reading_counts(manifest).of_all()
     status.findings = findings_of(session.survey, [r for r in records.values() if r.key in keys], manifest)
     for stage in stages():
         try:
@@ -280,16 +278,10 @@ def _copy_faults(store: Store, keys: Sequence[str]) -> list[str]:
 
 
 def _check_output(store: Store, folder: Path, record: OutputRecord) -> str | None:
-    if (fault := size_fault(store, record.path, record.bytes)) is not None:
-        return fault
-    try:
-        with store.copied(record.path, folder) as local:
-            return digest_fault(local, record.path, record.digest) or _unopened(local, record)
-    except OSError as error:
-        return unread_fault(record.path, error)
+    return fault_of(store, folder, record.path, record.bytes, record.digest, functools.partial(_unopened, record))
 
 
-def _unopened(local: Path, record: OutputRecord) -> str | None:
+def _unopened(record: OutputRecord, local: Path) -> str | None:
     """Return why an output's file, of which `local` is a copy, is not what it should be."""
     try:
         if record.product in products():

@@ -10,7 +10,7 @@ from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
 from roadscan.footprints.footprints import PRODUCT as FOOTPRINTS
 from roadscan.footprints.stage import faults_of_plan
-from roadscan.georeference.reading_counts import LogCounts, counts_by_log, fate_words, lost_findings, of_all
+from roadscan.georeference.reading_counts import LogCounts, fate_words, lost_findings
 from roadscan.run.engine.compute import LazyTasks
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState, check_stages_ahead
@@ -18,7 +18,7 @@ from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import Manifest
 from roadscan.tiles.product import TileProduct
 from roadscan.tiles.tasks.passes_apart import apart_findings
-from roadscan.tiles.tasks.tile_figures import tile_figures
+from roadscan.tiles.tasks.tile_figures import reading_counts, tile_figures
 from roadscan.tiles.tasks.tile_files import tile_file_names
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, TileTask
 from roadscan.tiles.tasks.tile_work import memory_of, plan_tile_work
@@ -73,13 +73,10 @@ class Tiles(Stage):
         manifest = session.manifest
         session.failed(self.name, faults_of_plan(session))
         computed = [manifest.get(TILE, str(tile)) for tile in chosen]
-        logs = counts_by_log(
-            [*manifest.of(FOOTPRINTS).values(), *(record for record in computed if record is not None)]
-        )
+        counts = LogCounts([*manifest.of(FOOTPRINTS).values(), *(record for record in computed if record is not None)])
         if manifest.without_file(TILE) and not manifest.files().get(TILE):
-            why = (
-                fate_words(of_all(logs)) or "all lie off the centre lines of filters.centre_line, or outside all passes"
-            )
+            nowhere = "all lie off the centre lines of filters.centre_line, or outside all passes"
+            why = fate_words(counts.of_all()) or nowhere
             reason = f"no tile holds a reading: {why}; check the settings that leave them out"
             session.failed(self.name, [("as a whole", reason)])
 
@@ -104,9 +101,9 @@ class Tiles(Stage):
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
         """Return logs of which many readings have no pose, and passes that lie at different heights."""
-        found = tile_figures(manifest)
-        logs = (LogCounts(manifest.of(FOOTPRINTS).values()) + found.counts).by_log()
-        return [*lost_findings(logs, records, survey.config.checks.lost_share), *apart_findings(found.apart)]
+        logs = reading_counts(manifest).by_log()
+        lost = lost_findings(logs, records, survey.config.checks.lost_share)
+        return [*lost, *apart_findings(tile_figures(manifest).apart)]
 
     def folders(self) -> Sequence[str]:
         """Return the folders of tile files, those of surfaces included."""

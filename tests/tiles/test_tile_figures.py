@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from roadscan.core.ids import TileId
-from roadscan.georeference.reading_counts import counts_by_log
+from roadscan.georeference.reading_counts import LogCounts
 from roadscan.run.engine.fingerprint import key_of, keys_beside
 from roadscan.store.manifest import CHANGED, DAMAGED, MISSING, Manifest, OutputRecord
 from roadscan.store.store import Store
@@ -60,7 +60,7 @@ def test_reasons_are_those_of_one_by_one(manifest: Manifest) -> None:
 
 def test_figures_are_those_of_one_by_one_until_a_record_changes(manifest: Manifest) -> None:
     found, records = tile_figures(manifest), manifest.of(TILE).values()
-    assert found.counts.by_log() == counts_by_log(records)
+    assert found.counts.by_log() == LogCounts(records).by_log()
     assert found.summaries == {s.tile: s for r in records if (s := summary_of(r)) is not None}
     assert found.contents.keys() == {TileId.parse(r.unit) for r in records if r.path}
     assert tile_figures(manifest) is found

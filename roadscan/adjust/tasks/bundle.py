@@ -27,7 +27,7 @@ from roadscan.pictures.frames.chosen import camera_pictures
 from roadscan.pictures.points import TABLE, measured_points
 from roadscan.pictures.settings import PictureTiesConfig
 from roadscan.pictures.ties.work import ALL, TRACKS
-from roadscan.store.manifest import Manifest, read_recorded
+from roadscan.store.manifest import Manifest, recorded_table
 from roadscan.store.store import Store
 
 Float64 = npt.NDArray[np.float64]
@@ -184,7 +184,7 @@ def _tracks(store: Store, manifest: Manifest, index: dict[tuple[str, str], int])
     record = manifest.get(TRACKS, ALL)
     if record is None or not record.path:
         return _Part(np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.int64))
-    rows = store.parse_table(read_recorded(store, record), record.path)
+    rows = recorded_table(store, record)
     names = zip(*(rows.column(c).to_pylist() for c in ("log", "file")), strict=True)
     picture = np.array([index.get(one, -1) for one in names], np.int64)
     here = picture >= 0

@@ -31,7 +31,7 @@ from roadscan.georeference.sources import MapSettings
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.digest import bytes_digest
-from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
@@ -323,7 +323,7 @@ def load_sightings(
         record = manifest.get(SIGHTINGS, task.unit)
         if record is None or not record.path:
             continue
-        for row in store.parse_table(read_recorded(store, record), record.path).to_pylist():
+        for row in recorded_table(store, record).to_pylist():
             sightings.append(_sighting(task.point, row, task.runs))
             rows.append(row)
     return sightings, rows

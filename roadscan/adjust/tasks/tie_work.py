@@ -26,7 +26,7 @@ from roadscan.poses.mounting_change import Seat
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.digest import bytes_digest
-from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.store.writer import parquet_bytes
@@ -246,7 +246,7 @@ def load_ties(
     """
     records = [r for task in tasks if (r := manifest.get(TIES, task.unit)) is not None and r.path]
     empty = table_schema(TIES).arrow().empty_table()
-    rows = pa.concat_tables([empty, *(store.parse_table(read_recorded(store, r), r.path) for r in records)])
+    rows = pa.concat_tables([empty, *(recorded_table(store, r) for r in records)])
     last = np.zeros(1 + max((place.number for task in tasks for place in task.places), default=0), np.uint8)
     for task in tasks:
         at = [place.number for place in task.places]

@@ -66,6 +66,12 @@ class Judge:
     digest: str
     """First 16 hexadecimal digits of the SHA-256 of the file: results depend on it, so it is named in the code."""
 
+    def of_each(self, segments: Sequence[Mapping[str, float]]) -> Float64:
+        """Returns the same (n,) of segments whose features are told one by one; none of none."""
+        names = segments[0] if segments else ()
+        told = {name: [one[name] for one in segments] for name in names}
+        return self.probability(told) if told else np.empty(0)
+
     def probability(self, features: Mapping[str, npt.ArrayLike]) -> Float64:
         """Returns the probability (n,) that each segment is what the question asks for.
 

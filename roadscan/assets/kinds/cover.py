@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
-import numpy as np
 import pyarrow as pa
 
 from roadscan.assets.covers.spots import Spot, spots_of
@@ -18,6 +17,7 @@ COVER, DRAIN = Judge("cover", "ca6cde9aee6bf58d"), Judge("drain", "fa919facd8bfe
 """Who is asked whether a spot is a cover or a drain, and which of these it is."""
 _LEAST: Final = 0.9
 """Less probable spots are left out: on a street of a sort that the judge has not seen, worn asphalt reaches 0.8."""
+_LEAST_DRAIN: Final = 0.5  # More probable ones are drains.
 _APART_M: Final = 0.4  # Spots nearer to one another (m) are one.
 _PLACE_SIGMA_M: Final = 0.05  # 1 σ of the middle of a spot (m), half the distance of scan lines.
 _GROUND_SIGMA_M: Final = 0.01  # 1 σ of the height of the ground there (m).
@@ -47,12 +47,10 @@ class Cover(AssetKind):
 
 def told_apart(spots: list[Spot]) -> list[tuple[Spot, str, float]]:
     """Returns the spots that are probably a cover or a drain, each with its type and that probability."""
-    if not spots:
-        return []
-    features = {name: np.array([one.features[name] for one in spots]) for name in spots[0].features}
-    either, drain = COVER.probability(features).tolist(), DRAIN.probability(features).tolist()
-    told = [(one, "drain" if d >= 0.5 else "cover", p) for one, p, d in zip(spots, either, drain, strict=True)]
-    return [one for one in told if one[2] >= _LEAST]
+    told = [one.features for one in spots]
+    either, drain = COVER.of_each(told).tolist(), DRAIN.of_each(told).tolist()
+    types = ["drain" if p >= _LEAST_DRAIN else "cover" for p in drain]
+    return [one for one in zip(spots, types, either, strict=True) if one[2] >= _LEAST]
 
 
 def _place(scene: Scene, spot: Spot, kind: str, probability: float) -> Place:

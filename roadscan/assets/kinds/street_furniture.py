@@ -55,10 +55,8 @@ class StreetFurniture(AssetKind):
 
 def told_apart(things: list[Compact]) -> list[tuple[Compact, str, float]]:
     """Returns the things that are probably furniture, each with its most probable type and that probability."""
-    if not things:
-        return []
-    features = {name: np.array([one.features[name] for one in things]) for name in things[0].features}
-    stated = np.column_stack([judge.probability(features) for judge in JUDGES.values()])
+    features = [one.features for one in things]
+    stated = np.column_stack([judge.of_each(features) for judge in JUDGES.values()])
     best, types = stated.argmax(axis=1).tolist(), list(JUDGES)
     told = [(one, types[k], float(p[k])) for one, k, p in zip(things, best, stated, strict=True)]
     return [one for one in told if one[2] >= _LEAST]

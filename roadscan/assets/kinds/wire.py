@@ -54,11 +54,8 @@ class Wire(AssetKind):
 def judged(pieces: pa.Table) -> list[tuple[Span, float]]:
     """Returns the spans that are probably wires, each with its probability."""
     spans = list(spans_of(pieces))
-    if not spans:
-        return []
-    told = [features_of(one, pieces) for one in spans]
-    stated = JUDGE.probability({name: np.array([one[name] for one in told]) for name in told[0]})
-    return [(span, p) for span, p in zip(spans, stated.tolist(), strict=True) if p >= _LEAST]
+    stated = JUDGE.of_each([features_of(one, pieces) for one in spans]).tolist()
+    return [(span, p) for span, p in zip(spans, stated, strict=True) if p >= _LEAST]
 
 
 def _object(pieces: pa.Table, span: Span, probability: float) -> AssetObject:

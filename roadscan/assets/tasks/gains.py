@@ -27,7 +27,7 @@ from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import reason_of
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.digest import bytes_digest
-from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.store.writer import parquet_bytes
 from roadscan.tiles.blocks import Block, cut_blocks
@@ -193,7 +193,7 @@ def _samples(gains: GainsPlan, manifest: Manifest, plan: AssetPlan) -> list[Inte
     for square, _ in gains.samples:
         record = held.get(str(square))
         if record is not None and record.path:
-            rows = store.parse_table(read_recorded(store, record), record.path)
+            rows = recorded_table(store, record)
             columns = {name: rows[name].to_numpy() for name in _COLUMNS}
             unit = float(rows["unit"][0].as_py())
             samples.append(IntensitySample(grid.corner_m(square), plan.sensors, **columns, unit=unit))

@@ -22,7 +22,7 @@ from roadscan.run.engine.compute import damaged_file, reason_of
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.asset_schema import asset_schema
 from roadscan.store.digest import bytes_digest
-from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.store import Store
 from roadscan.tiles.tasks.tiles import TaskResult
 
@@ -191,4 +191,4 @@ def _near(task: JoinTask, records: Sequence[OutputRecord], near: set[TileId]) ->
 
 
 def _read(store: Store, record: OutputRecord) -> pa.Table:
-    return store.parse_table(read_recorded(store, record), record.path)
+    return recorded_table(store, record)

@@ -26,7 +26,7 @@ from roadscan.pictures.placed import Pictures, plan_pictures
 from roadscan.run.code_reach import code_digest, name_of
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.digest import bytes_digest, file_digest
-from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.store import Store
 
 SEEN: Final = "asset_pictures"
@@ -194,7 +194,7 @@ def _objects(
     held = [r for unit, r in sorted(manifest.of(OBJECTS).items()) if unit.startswith(f"{kind}/") and r.path]
     parts: dict[TileId, list[tuple[OutputRecord, pa.Table]]] = {}
     for record in held:
-        rows = plan.survey.store.parse_table(read_recorded(plan.survey.store, record), record.path)
+        rows = recorded_table(plan.survey.store, record)
         for square, own in rows_by_square(rows, plan.grid):
             parts.setdefault(square, []).append((record, own))
     found = []

@@ -27,7 +27,7 @@ from roadscan.pictures.placed import Pictures
 from roadscan.pictures.views import NO_VIEW, WIDTH, Sights, best_views
 from roadscan.run.engine.compute import reason_of
 from roadscan.store.digest import bytes_digest
-from roadscan.store.manifest import OutputRecord, read_recorded
+from roadscan.store.manifest import OutputRecord, recorded_table
 from roadscan.tiles.tasks.tiles import TaskResult
 
 Float64 = npt.NDArray[np.float64]
@@ -178,7 +178,7 @@ class _Search:
         return reader.read(found.colour[is_own & found.seen], found.colour[~is_own & found.seen])
 
     def _read(self, record: OutputRecord) -> pa.Table:
-        return self._task.store.parse_table(read_recorded(self._task.store, record), record.path)
+        return recorded_table(self._task.store, record)
 
 
 @dataclass(frozen=True, eq=False)

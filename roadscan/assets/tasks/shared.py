@@ -7,7 +7,7 @@ from typing import NamedTuple
 import pyarrow as pa
 
 from roadscan.assets.statistics import Statistics
-from roadscan.store.manifest import OutputRecord, read_recorded
+from roadscan.store.manifest import OutputRecord, recorded_table
 from roadscan.store.store import Store
 
 
@@ -25,9 +25,9 @@ class Shared(NamedTuple):
 
     def read_gains(self, store: Store) -> pa.Table | None:
         """Returns the gains of the intensity; None where it is used as recorded."""
-        return None if self.gains is None else store.parse_table(read_recorded(store, self.gains), self.gains.path)
+        return None if self.gains is None else recorded_table(store, self.gains)
 
     def read_statistics(self, store: Store) -> Statistics:
         """Returns the statistics of the survey."""
-        rows = store.parse_table(read_recorded(store, self.statistics), self.statistics.path)
+        rows = recorded_table(store, self.statistics)
         return Statistics(dict(zip(rows["statistic"].to_pylist(), rows["value"].to_pylist(), strict=True)))

@@ -23,7 +23,7 @@ from roadscan.condition.tasks.lines import Roads
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.asset_schema import ASSET_FOLDER, AssetSchema
-from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.store.manifest import Manifest, OutputRecord, read_recorded, recorded_table
 from roadscan.store.store import Store
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.geo_table import read_geo_table, write_geo_table
@@ -113,7 +113,7 @@ def _one_geojson(path: Path, layers: Sequence[Layer], context: ProductContext) -
 def write_table(task: TableTask, roads: Roads, drives: Drives, store: Store, context: ProductContext) -> OutputRecord:
     """Write a kind's table: the objects of all clusters, with positions along the roads, and σ of the poses."""
     schema = task.schema.arrow()
-    parts = [store.parse_table(read_recorded(store, r), r.path).cast(schema) for r in task.objects]
+    parts = [recorded_table(store, r).cast(schema) for r in task.objects]
     rows = with_pose_sigma(pa.concat_tables([schema.empty_table(), *parts]).combine_chunks(), drives)
     along = along_roads(np.column_stack([rows["easting_m"].to_numpy(), rows["northing_m"].to_numpy()]), roads)
     told: Mapping[str, pa.Array] = {
@@ -125,7 +125,7 @@ def write_table(task: TableTask, roads: Roads, drives: Drives, store: Store, con
     for name, values in told.items():
         index = rows.schema.get_field_index(name)
         rows = rows.set_column(index, rows.schema.field(index), values)
-    rows = _with_pictures(rows, [store.parse_table(read_recorded(store, r), r.path) for r in task.seen])
+    rows = _with_pictures(rows, [recorded_table(store, r) for r in task.seen])
     rows = rows.sort_by([(name, "ascending") for name in ("road", "station_m", "easting_m", "northing_m", "object")])
     shapes = shapely.from_wkb(rows["geometry"].to_numpy())
     with store.scratch() as folder:

@@ -36,7 +36,7 @@ _LEAST_BINS: Final = 5
 """Least number of the twelve bins with returns on the line."""
 _VEGETATION: Final = (classes.LOW_VEGETATION, classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION)
 _NO_WIRE: Final = (classes.GROUND, classes.ROAD, classes.LOW_NOISE, classes.PERSON)
-_LEVELS: Final = range(2, 9)
+_LEVELS: Final = np.arange(2, 9)
 """Cubes below and above one (0.5 to 2.25 m) in which a wall, a crown or a roof shows itself."""
 _MOST_CUBES: Final = 20
 """More of the 63 cubes below, or of those above, belong to a wall or a crown: a line in it is no wire."""
@@ -65,10 +65,10 @@ def thin_cubes(scene: Scene) -> tuple[pa.Table, list[Int64]]:
     east, north = returns.corner_m
     xyh = np.column_stack([returns.x_m[rows], returns.y_m[rows], returns.height_m[rows]])
     cell = np.floor((xyh + np.array([east, north, 0.0])) / CUBE_M).astype(np.int64)
-    low = cell.min(axis=0) - 1 - _LEVELS.stop
-    span = cell.max(axis=0) + 2 + _LEVELS.stop - low
-    _, first, own, number = np.unique(_packed(cell, low, span), return_index=True, return_inverse=True,
-                                      return_counts=True)  # fmt: skip
+    low = cell.min(axis=0) - 1 - (_LEVELS[-1] + 1)
+    _, columns, layers = cell.max(axis=0) + 2 + (_LEVELS[-1] + 1) - low
+    packed = (cell - low) @ [columns * layers, layers, 1]  # one number a cube; that of a cube beside it is so much more
+    cubes_with, first, own, number = np.unique(packed, return_index=True, return_inverse=True, return_counts=True)
     places = cell[first]
     middle = np.column_stack([np.bincount(own, xyh[:, k]) for k in range(3)]) / number[:, None]
     tile = scene.tile
@@ -83,7 +83,8 @@ def thin_cubes(scene: Scene) -> tuple[pa.Table, list[Int64]]:
     filled, beside = np.empty(chosen.size, np.int64), np.empty(chosen.size, np.int64)
     line = np.zeros((chosen.size, 3))
     lines_through(middle, chosen, starts, near, _LIMITS, filled, beside, line)
-    below, above = (_filled_levels(places, chosen, way) for way in (-1, 1))
+    steps = [(i * columns + j) * layers for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    below, above = (_filled(cubes_with, chosen, np.add.outer(steps, way * _LEVELS).ravel()) for way in (-1, 1))
     kept = np.flatnonzero((filled >= _LEAST_BINS) & (below <= _MOST_CUBES) & (above <= _MOST_CUBES))
     cubes = chosen[kept]
     bounds, order = in_bins(own.astype(np.int32), len(places))
@@ -104,17 +105,8 @@ def thin_cubes(scene: Scene) -> tuple[pa.Table, list[Int64]]:
     return table, held
 
 
-def _packed(cell: Int64, low: Int64, span: Int64) -> Int64:
-    """Returns one number for each cell (…, 3) of a box of `span` cells from its corner `low`."""
-    moved = cell - low
-    return np.asarray((moved[..., 0] * span[1] + moved[..., 1]) * span[2] + moved[..., 2])
-
-
-def _filled_levels(places: Int64, cubes: Int64, way: int) -> Int64:
-    """Returns how many cubes (n,) hold returns in the nine columns about each, some levels below (−1) or above (1)."""
-    low = places.min(axis=0) - 1 - _LEVELS.stop
-    span = places.max(axis=0) + 2 + _LEVELS.stop - low
-    steps = np.array([(i, j, way * level) for i in (-1, 0, 1) for j in (-1, 0, 1) for level in _LEVELS])
-    asked, filled = _packed(places[cubes][:, None] + steps, low, span), _packed(places, low, span)
-    at = np.minimum(np.searchsorted(filled, asked), filled.size - 1)
-    return np.asarray((filled[at] == asked).sum(axis=1))
+def _filled(cubes_with: Int64, chosen: Int64, steps: Int64) -> Int64:
+    """Returns how many of the cubes some steps from each chosen one (n,) hold returns; cubes are packed, ascending."""
+    asked = cubes_with[chosen][:, None] + steps
+    at = np.minimum(np.searchsorted(cubes_with, asked), cubes_with.size - 1)
+    return np.asarray((cubes_with[at] == asked).sum(axis=1))

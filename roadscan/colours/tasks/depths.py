@@ -24,7 +24,7 @@ from roadscan.georeference.place import Window
 from roadscan.georeference.sources import Georeferencer
 from roadscan.pictures.colours import ColourSource
 from roadscan.pictures.placed import Pictures
-from roadscan.store.manifest import OutputRecord, read_recorded
+from roadscan.store.manifest import OutputRecord, recorded_table
 from roadscan.store.store import Store
 from roadscan.tiles.tasks.tile_files import publish_file
 from roadscan.tiles.tasks.tile_plan import TileTask
@@ -163,7 +163,7 @@ class Shown:
 
 def read_shown(store: Store, record: OutputRecord) -> list[Shown]:
     """Returns what the pictures of a batch show, in its order."""
-    table = store.parse_table(read_recorded(store, record), record.path)
+    table = recorded_table(store, record)
     found = []
     for row in table.select(["rows", "columns", "factor", *_IMAGES]).to_pylist():
         shape = row["rows"], row["columns"]
@@ -186,7 +186,7 @@ class Sampled:
 
 def read_samples(store: Store, record: OutputRecord) -> Sampled:
     """Returns the samples of a batch, in its order."""
-    table = store.parse_table(read_recorded(store, record), record.path, _SAMPLED)
+    table = recorded_table(store, record, _SAMPLED)
     samples = [
         PictureSample(np.asarray(c, np.int64), np.asarray(v, np.float32).reshape(-1, 3))
         for c, v in zip(table["cell"].to_pylist(), table["colour"].to_pylist(), strict=True)

@@ -16,7 +16,7 @@ from roadscan.colours.tasks.plan import DEPTHS, ColourPlan
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.digest import bytes_digest
-from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.store.writer import parquet_bytes
@@ -111,7 +111,7 @@ def read_gains(plan: ColourPlan, manifest: Manifest, tables: Sequence[GainsTable
         record = manifest.get(GAINS, table.run)
         if record is None:
             continue
-        held = plan.survey.store.parse_table(read_recorded(plan.survey.store, record), record.path)
+        held = recorded_table(plan.survey.store, record)
         for row in held.to_pylist():
             number = rows.get((row["run"], row["camera"], row["file"], row["epoch_gps_ns"]), -1)
             if number < 0:

@@ -22,7 +22,7 @@ from roadscan.core.extras import can_draw
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.digest import file_digest
-from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 
@@ -94,7 +94,7 @@ def draw_picture(one: PictureTask) -> OutputRecord:
 
 def _values(store: Store, records: Sequence[OutputRecord]) -> pa.Table:
     schema = table_schema(VALUES).arrow()
-    parts = [store.parse_table(read_recorded(store, r), r.path).cast(schema) for r in records]
+    parts = [recorded_table(store, r).cast(schema) for r in records]
     return pa.concat_tables([schema.empty_table(), *parts])
 
 

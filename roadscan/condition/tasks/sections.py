@@ -22,7 +22,7 @@ from roadscan.condition.tasks.values import VALUES
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.digest import file_digest
-from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.tiles.product import ProductContext
@@ -136,7 +136,7 @@ def section_table(files: SectionFiles) -> tuple[pa.Table, npt.NDArray[Any]]:
 
 def _of_sections(files: SectionFiles) -> pa.Table:
     schema = table_schema(VALUES).arrow()
-    parts = [files.store.parse_table(read_recorded(files.store, r), r.path).cast(schema) for r in files.values]
+    parts = [recorded_table(files.store, r).cast(schema) for r in files.values]
     held = [p.filter(pc.equal(p["extent"], "section")) for p in parts]
     return pa.concat_tables([schema.empty_table(), *held])
 

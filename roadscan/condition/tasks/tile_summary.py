@@ -20,7 +20,7 @@ from roadscan.core.ids import TileId
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.digest import file_digest
-from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.tiles.products.geo_table import write_geo_table
 
@@ -148,7 +148,7 @@ def _values(files: SectionFiles) -> Iterator[tuple[str, str, Sequence[Mapping[st
     """Yield the values for the table, one file at a time, with their road and lane."""
     wanted = pa.array(sorted({*_MEANS.values(), *_GREATEST.values(), *_RUTS}))
     for record in files.values:
-        table = files.store.parse_table(read_recorded(files.store, record), record.path)
+        table = recorded_table(files.store, record)
         rows = table.filter(pc.is_in(table["quantity"], wanted))
         rows = rows.cast(pa.schema([table_schema(VALUES).arrow().field(n) for n in rows.column_names]))
         if rows.num_rows:

@@ -39,7 +39,7 @@ from roadscan.run.code_reach import code_digest, name_of
 from roadscan.run.engine.compute import damaged_file, reason_of
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.digest import bytes_digest
-from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.store.manifest import Manifest, OutputRecord, read_recorded, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.store.writer import parquet_bytes
@@ -327,7 +327,7 @@ def _within(cross: CrossSections, sections_m: Sequence[tuple[float, float]]) -> 
 
 
 def _tables(store: Store, records: Sequence[OutputRecord], schema: pa.Schema) -> pa.Table:
-    parts = [store.parse_table(read_recorded(store, r), r.path) for r in records]
+    parts = [recorded_table(store, r) for r in records]
     return pa.concat_tables([schema.empty_table(), *(p.cast(schema) for p in parts)])
 
 

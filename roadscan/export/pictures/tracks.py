@@ -19,7 +19,7 @@ from roadscan.pictures.ties.tracks import places_of
 from roadscan.pictures.ties.work import ALL, TRACKS
 from roadscan.pictures.views import Views
 from roadscan.run.session import Session
-from roadscan.store.manifest import read_recorded
+from roadscan.store.manifest import recorded_table
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -93,7 +93,7 @@ def _pictures(rows: pa.Table, tracks: pa.Table, names: Sequence[tuple[object, ob
 
 def _table(session: Session, name: str, unit: str | None) -> pa.Table | None:
     records = [one for key, one in session.manifest.of(name).items() if one.path and unit in (None, key)]
-    return session.store.parse_table(read_recorded(session.store, records[0]), records[0].path) if records else None
+    return recorded_table(session.store, records[0]) if records else None
 
 
 def _keys(rows: pa.Table, *more: str) -> list[tuple[object, ...]]:

@@ -25,7 +25,7 @@ from roadscan.pictures.ties.tracks import places_of
 from roadscan.pictures.ties.work import ALL, CHAINS, FEATURES, TRACKS, Chains, TieWork, chains_of, rows_of, written
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
-from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 
@@ -173,7 +173,7 @@ def write_tracks(work: TieWork, tasks: Sequence[RefineTask], manifest: Manifest,
         record = manifest.get(REFINED, task.unit)
         others[task.row], pixel[task.row] = True, np.nan
         if record is not None and record.path:
-            rows = store.parse_table(read_recorded(store, record), record.path)
+            rows = recorded_table(store, record)
             pixel[task.row] = np.column_stack([rows.column(name).to_numpy() for name in ("u_px", "v_px")])
     found, count = np.isfinite(pixel[:, 0]), int(chains.track.max(initial=-1)) + 1
     alone = (np.bincount(chains.track[found], minlength=count) < 2)[chains.track]

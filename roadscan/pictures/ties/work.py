@@ -28,7 +28,7 @@ from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.codecs.image_files import ImageError
 from roadscan.store.digest import bytes_digest
-from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
+from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.store.writer import parquet_bytes
@@ -239,7 +239,7 @@ def match_picture(task: MatchTask) -> OutputRecord:
 
 def _load(store: Store, record: OutputRecord) -> Features:
     """Returns the features of a picture."""
-    rows = store.parse_table(read_recorded(store, record), record.path)
+    rows = recorded_table(store, record)
     pixel = np.stack([rows.column(name).to_numpy() for name in ("u_px", "v_px")], axis=-1)
     descriptor = rows.column("descriptor").combine_chunks().flatten().to_numpy()
     return Features(pixel, rows.column("size_px").to_numpy(), descriptor.reshape(-1, DESCRIPTOR))
@@ -284,7 +284,7 @@ def write_chains(work: TieWork, tasks: Sequence[MatchTask], manifest: Manifest, 
         record = manifest.get(MATCHES, task.unit)
         if record is None or not record.path:
             continue
-        rows = store.parse_table(read_recorded(store, record), record.path)
+        rows = recorded_table(store, record)
         names = rows.column("other").dictionary_encode().combine_chunks()
         others = np.array([number[name] for name in names.dictionary.to_pylist()], np.int64)
         first.append(starts[task.number] + rows.column("first").to_numpy())
@@ -387,7 +387,7 @@ def chains_of(work: TieWork, manifest: Manifest, store: Store) -> Chains:
     record = manifest.get(CHAINS, ALL)
     if record is None or not record.path:
         return Chains(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0))
-    rows = store.parse_table(read_recorded(store, record), record.path)
+    rows = recorded_table(store, record)
     logs = [work.exposures.cameras[k].log for k in work.exposures.camera.tolist()]
     number = {one: k for k, one in enumerate(zip(logs, work.exposures.file.tolist(), strict=True))}
     names = zip(*(rows.column(c).to_pylist() for c in ("log", "file")), strict=True)

@@ -11,7 +11,7 @@ from roadscan.adjust.tasks.outcome import FOLDER, PICTURES
 from roadscan.report.blocks import Block, Paragraph, Picture, Table
 from roadscan.report.section import Material, Section
 from roadscan.run.session import Session
-from roadscan.store.manifest import read_recorded
+from roadscan.store.manifest import recorded_table
 
 _WORST: Final = 8  # Pictures that are listed.
 _FEWEST: Final = 10  # Measurements of a picture that is compared.
@@ -42,7 +42,7 @@ class Pictures(Section):
 
 def _table(session: Session, name: str) -> pa.Table | None:
     records = [record for record in session.manifest.of(name).values() if record.path]
-    return session.store.parse_table(read_recorded(session.store, records[0]), records[0].path) if records else None
+    return recorded_table(session.store, records[0]) if records else None
 
 
 def _of(rows: pa.Table, by: list[str]) -> list[dict[str, Any]]:

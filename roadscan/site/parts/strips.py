@@ -21,7 +21,7 @@ from roadscan.site.document import Ask, Document, json_bytes
 from roadscan.site.layer import title_of
 from roadscan.site.material import Material
 from roadscan.site.part import SitePart
-from roadscan.store.manifest import OutputRecord, read_recorded
+from roadscan.store.manifest import OutputRecord, recorded_table
 
 _SERIES: Final = ("station_from_m", "station_to_m", "value", "sigma", "share", "reason")
 _TOLD: Final = ("from_m", "to_m", "value", "sigma", "share", "reason")
@@ -200,7 +200,7 @@ def _first_station(lane: Lane, record: OutputRecord) -> float:
 
 def _column(lane: Lane, record: OutputRecord, name: str) -> npt.NDArray[Any]:
     store = lane.material.store
-    column: npt.NDArray[Any] = store.parse_table(read_recorded(store, record), record.path, [name])[name].to_numpy()
+    column: npt.NDArray[Any] = recorded_table(store, record, [name])[name].to_numpy()
     return column
 
 

@@ -16,40 +16,43 @@ from roadscan.store.readings.read_ahead import ReadAhead
 from roadscan.store.store import Store
 
 
-class LocalBytes:
-    """A file of a folder."""
+class HeldBytes:
+    """An object that is in memory, because it is small."""
 
-    def __init__(self, path: str) -> None:
-        self.stream: Any = io.FileIO(path)
-        weakref.finalize(self, self.stream.close)
+    def __init__(self, stream: Any) -> None:
+        self.stream = stream
+        weakref.finalize(self, stream.close)
 
     def expect(self, start: int, end: int) -> None:
-        """Announce bytes `start` to `end`, so that the system reads them into its cache."""
-        if hasattr(os, "posix_fadvise"):
-            os.posix_fadvise(self.stream.fileno(), start, end - start, os.POSIX_FADV_WILLNEED)
+        """Announce bytes `start` to `end`: here they are at hand."""
 
     def read_into(self, start: int, room: memoryview) -> bool:
         """Fill `room` with the bytes from `start` on; return False where the file is too short."""
         return _filled(self.stream, start, room)
 
 
-class RemoteBytes:
-    """An object of any fsspec file system. Announced bytes that are not read yet stay in memory.
+class LocalBytes(HeldBytes):
+    """A file of a folder."""
 
-    An object that is known to be small is in memory from the beginning.
-    """
+    def expect(self, start: int, end: int) -> None:
+        """Announce bytes `start` to `end`, so that the system reads them into its cache."""
+        if hasattr(os, "posix_fadvise"):
+            os.posix_fadvise(self.stream.fileno(), start, end - start, os.POSIX_FADV_WILLNEED)
 
-    def __init__(self, store: Store, file: str) -> None:
-        self.stream: Any = store.opened(file)
-        weakref.finalize(self, self.stream.close)
-        self._fetch = functools.partial(store.fs.cat_file, store.path(file))
+
+class RemoteBytes(HeldBytes):
+    """An object of any fsspec file system. Announced bytes that are not read yet stay in memory."""
+
+    def __init__(self, store: Store, path: str) -> None:
+        super().__init__(store.fs.open(path, "rb"))
+        self._fetch = functools.partial(store.fs.cat_file, path)
         self._ahead: ReadAhead[bytes] = ReadAhead()
         self._expected: list[tuple[int, int]] = []
         self._start, self._held = 0, b""
 
     def expect(self, start: int, end: int) -> None:
         """Start to fetch bytes `start` to `end` in one request."""
-        if (start, end) not in self._expected and type(self.stream) is not io.BytesIO:
+        if (start, end) not in self._expected:
             self._expected.append((start, end))
             self._ahead.begin((start, end), functools.partial(self._fetch, start=start, end=end))
 
@@ -67,9 +70,13 @@ class RemoteBytes:
         return True
 
 
-def opened(store: Store, file: str) -> LocalBytes | RemoteBytes:
-    """Open a file of a store by its path in it."""
-    return LocalBytes(store.path(file)) if store.is_folder else RemoteBytes(store, file)
+def opened(store: Store, file: str) -> HeldBytes:
+    """Open a file of a store by its path in it; an object that is known to be small comes by one request."""
+    if store.is_folder:
+        return LocalBytes(io.FileIO(store.path(file)))
+    if store.is_small(file):
+        return HeldBytes(io.BytesIO(store.read_bytes(file)))
+    return RemoteBytes(store, store.path(file))
 
 
 def _filled(stream: Any, start: int, room: memoryview) -> bool:

@@ -14,10 +14,10 @@ from roadscan.core.errors import StoreError
 from roadscan.store.codecs.choice import LIBRARY
 from roadscan.store.codecs.parquet.page_file import DamageError, PageFile, read_footer
 from roadscan.store.damage import ROWS_CHANGE, UNREADABLE, unread
-from roadscan.store.readings.byte_source import LocalBytes, RemoteBytes, opened
+from roadscan.store.readings.byte_source import HeldBytes, opened
 from roadscan.store.store import Store
 
-Footer: TypeAlias = tuple[LocalBytes | RemoteBytes, pq.FileMetaData, bool]
+Footer: TypeAlias = tuple[HeldBytes, pq.FileMetaData, bool]
 """An open file, its footer, and whether roadscan's own writer wrote it."""
 Rows = TypeVar("Rows")
 Pages = TypeVar("Pages", bound=PageFile)

@@ -23,7 +23,7 @@ from roadscan.core.ids import TileId
 from roadscan.core.survey import CellColumns
 from roadscan.store.codecs.parquet.number_table import Lists, write_number_groups
 from roadscan.store.damage import UNREADABLE
-from roadscan.store.manifest import OutputRecord, read_recorded
+from roadscan.store.manifest import OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.store.store import MADE_AGAIN, Store
 from roadscan.tiles.cells import TileCells
@@ -76,7 +76,7 @@ def write_overviews(path: Path, levels: Sequence[Level]) -> None:
 
 def read_cells(store: Store, record: OutputRecord, cells_per_edge: int) -> TileCells:
     """Return the cells of a finished tile; columns missing in a ``surface`` are NaN, and it names no passes."""
-    rows = store.parse_table(read_recorded(store, record), record.path)
+    rows = recorded_table(store, record)
     n = rows.num_rows
     known: dict[str, Any] = {name: rows.column(name).to_numpy() for name in rows.column_names if name != "passes"}
     for column in table_schema("cells").columns:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from roadscan.core.ids import TileId
+from roadscan.footprints.footprints import PRODUCT as FOOTPRINTS
 from roadscan.georeference.reading_counts import LogCounts
 from roadscan.store.manifest import Manifest
 from roadscan.tiles.product import TileSummary
@@ -35,6 +36,11 @@ class TileFigures:
 def tile_figures(manifest: Manifest) -> TileFigures:
     """Return what the records of the tiles say; they are read once until they change."""
     return manifest.found(_read)
+
+
+def reading_counts(manifest: Manifest) -> LogCounts:
+    """Return the readings of a survey by log and outcome, from the records of footprints and tiles."""
+    return LogCounts(manifest.of(FOOTPRINTS).values()) + tile_figures(manifest).counts
 
 
 def _read(manifest: Manifest) -> TileFigures:

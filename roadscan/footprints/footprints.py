@@ -50,7 +50,7 @@ _NUMBER: Final = "slice_index"
 JOINED: Final = f"{PRODUCT}.joined"
 """Manifest name of the file with the footprints of all data files."""
 _ALL: Final = "all"
-_JOINED_FILE: Final = "manifest/footprints/all.parquet"
+_JOINED_FILE: Final = "manifest/joined/footprints.parquet"
 _JOINED_ROWS: Final = pa.schema([table_schema(PRODUCT).arrow().field(n) for n in _LOADED] + [(_NUMBER, pa.int32())])
 
 

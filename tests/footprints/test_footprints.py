@@ -125,7 +125,7 @@ def test_footprints_of_all_come_from_one_file(indexed, monkeypatch: pytest.Monke
     read, opened = Store.read_bytes, list[str]()
     monkeypatch.setattr(Store, "read_bytes", lambda store, path: opened.append(path) or read(store, path))
     whole = load_ranges(plan, manifest)
-    assert opened == ["manifest/footprints/all.parquet"]
+    assert opened == ["manifest/joined/footprints.parquet"]
     assert pairs_of(whole).tolist() == pairs_of(singly).tolist()
     assert whole.readings.tolist() == singly.readings.tolist()
     other = copy.copy(manifest)
@@ -133,4 +133,4 @@ def test_footprints_of_all_come_from_one_file(indexed, monkeypatch: pytest.Monke
     other._rows = {**manifest._rows, PRODUCT: {**manifest._rows[PRODUCT], first.unit: (*first._replace(digest=""),)}}
     opened.clear()
     load_ranges(plan, other)
-    assert len(opened) == len(whole.slices) and "manifest/footprints/all.parquet" not in opened
+    assert len(opened) == len(whole.slices) and "manifest/joined/footprints.parquet" not in opened

@@ -164,7 +164,7 @@ def test_a_run_mends_what_it_stumbles_over(made: tuple[Simulated, dict[str, byte
     cells, _, geotiff, las, single, table = spoil(store, "flipped")
     for path in (geotiff, las, single, table):  # nobody reads these
         store.write_bytes(path, before[path])
-    footprints = "manifest/footprints/all.parquet"
+    footprints = "manifest/joined/footprints.parquet"
     content = bytearray(store.read_bytes(footprints))
     content[len(content) // 2] ^= 1
     store.write_bytes(footprints, bytes(content))

@@ -12,6 +12,7 @@ import pytest
 import typer.testing
 from hypothesis import settings
 
+import roadscan  # noqa: F401 — before NumPy: it settles the last bits of libraries, as in a process of a worker
 from tests.drawing import blank
 from tests.measuring.drive import measured_drive
 from tests.surveys import adjusted, finished, raw_site, simulated

@@ -326,9 +326,8 @@ def _without_surveys(
         priors = [p.faster(times if shorter[0] else 1.0, times if shorter[1] else 1.0) for p in unknowns.priors]
         other = replace(unknowns, priors=tuple(priors))
         rounds = Rounds(_problem(other, observations), settings)
-        alone = rounds.without_surveys()
-        stays = (alone.process_factors == 1.0).all() and (alone.kind_factors == 1.0).all()
-        if stays and not rounds.contradicts_poses(alone):
+        alone, holds = rounds.as_stated()
+        if holds and not rounds.contradicts_poses(alone):
             return priors, other, rounds, alone
     return stated
 

@@ -18,7 +18,7 @@ from roadscan.adjust.observations import COMPONENTS, KINDS
 from roadscan.adjust.solver_settings import AdjustmentSettings
 from roadscan.adjust.sparse_normal import NormalEquations, Rows, SelectedInverse
 from roadscan.adjust.unknowns import Unknowns
-from roadscan.adjust.weights import Groups, LeftOut, left_out
+from roadscan.adjust.weights import Groups, LeftOut, Pace, left_out
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -29,8 +29,6 @@ SURVEY: Final = len(KINDS)
 _HUBER_ROUNDS: Final = 10  # Rounds with Huber's weights before IGG III.
 _SETTLED: Final = 0.01
 """Weights, and logarithms of factors, that change by less are final."""
-_CALM: Final = 15
-"""From this round on, weights move only halfway: two observations that exclude one another no longer alternate."""
 _LEAST: Final = 1e-6
 """Weight of a rejected survey: the point is then free, but its coordinates stay determined."""
 _ENOUGH: Final = 30.0
@@ -108,8 +106,8 @@ class Rounds:
         self._kinds, self._processes = np.ones(len(KINDS) + 1), np.ones(len(COMPONENTS))
         self._enough, self._fixed = _ENOUGH, np.zeros(len(COMPONENTS), bool)
 
-    def without_surveys(self) -> Estimate:
-        """Returns all rounds without the surveys of control points."""
+    def as_stated(self) -> tuple[Estimate, bool]:
+        """Returns the rounds without the surveys of control points, with all σ as stated, and whether these hold."""
         done = 0
         while done < min(_HUBER_ROUNDS, self.settings.max_rounds - 1):
             done += 1
@@ -117,7 +115,13 @@ class Rounds:
             if self._moved_to(self.problem.groups.huber(residual / np.sqrt(self._own()))) < 10 * _SETTLED:
                 break
         estimate = self._rounds(done)
-        if self.settings.estimate_variance_components is not None or not self._is_understated(estimate):
+        given = self.settings.estimate_variance_components is not None
+        return estimate, given or not self._is_understated(estimate)
+
+    def without_surveys(self) -> Estimate:
+        """Returns all rounds without the surveys of control points."""
+        estimate, holds = self.as_stated()
+        if holds:
             return estimate
         # Ties that contradict poses of too small a σ look wrong themselves: poses are tested first.
         self._processes *= _FREE
@@ -172,8 +176,10 @@ class Rounds:
 
     def _rounds(self, done: int) -> Estimate:
         """Run rounds of IGG III after those that are done."""
+        self._pace = Pace(self._weight.size)
+        self._factor_pace = Pace(self._kinds.size + self._processes.size)
         for number in range(self.settings.max_rounds):
-            estimate = self._judged(done + number + 1, calm=number >= _CALM)
+            estimate = self._judged(done + number + 1)
             if estimate.settled:
                 break
         return estimate
@@ -215,7 +221,7 @@ class Rounds:
         solution = self._equations.solve(right)
         return solution, self._observed - rows.times(solution)
 
-    def _judged(self, rounds: int, *, calm: bool) -> Estimate:
+    def _judged(self, rounds: int) -> Estimate:
         """Run one round of IGG III; it is settled when its result equals its input."""
         solution, residual = self._solved()
         inverse = self._equations.inverse()
@@ -224,9 +230,11 @@ class Rounds:
         without = left_out(residual, inverse.variances(), own, self._counted())
         near, far = self.settings.full_weight_within, self.settings.reject_beyond
         wanted = self.problem.groups.igg_iii(without.statistic, near, far)
-        moved = self._moved_to(0.5 * (weight + wanted) if calm else wanted)
+        moved = self._moved_to(weight + self._pace.step(wanted - weight))
         if self._estimating:
-            moved = max(moved, self._new_factors(solution, inverse, residual, without, own, weight))
+            way = np.log(self._new_factors(solution, inverse, residual, without, own, weight) / self._factors())
+            moved = max(moved, float(np.abs(way).max()))
+            self._set_factors(self._factors() * np.exp(self._factor_pace.step(way)))
         return Estimate(solution, inverse, residual, weight, without, kinds, processes, rounds, moved < _SETTLED)
 
     def _moved_to(self, weight: Float64) -> float:
@@ -243,12 +251,10 @@ class Rounds:
         """Returns whether the stated σ of a kind of observation, or of a component of the poses, is much too small."""
         if self._wide_kinds(estimate).any():
             return True
-        kinds, processes, own = self._kinds.copy(), self._processes.copy(), self._own()
-        self._new_factors(
-            estimate.solution, estimate.inverse, estimate.residual, estimate.without, own, estimate.weight
+        factors = self._new_factors(
+            estimate.solution, estimate.inverse, estimate.residual, estimate.without, self._own(), estimate.weight
         )
-        found, self._kinds, self._processes = self._processes, kinds, processes
-        return bool((found > _UNDERSTATED).any())
+        return bool((factors[self._kinds.size :] > _UNDERSTATED).any())
 
     def contradicts_poses(self, estimate: Estimate) -> bool:
         """Returns whether corrections of some component are larger than its process allows, by the quantile of χ²."""
@@ -320,23 +326,28 @@ class Rounds:
         without: LeftOut,
         own: Float64,
         weight: Float64,
-    ) -> float:
-        """Estimate the factors again (Förstner 1979); returns the largest change of their logarithms."""
-        before = np.concatenate([self._kinds, self._processes])
+    ) -> Float64:
+        """Returns all factors (kinds, processes) as they follow from the others (Förstner 1979)."""
+        kinds, processes = self._kinds.copy(), self._processes.copy()
         # Only the observation's share of its variance counts; the rest is that of lines between knots.
-        share = self.problem.variance * self._kinds[self.problem.kind] / own
+        share = self.problem.variance * kinds[self.problem.kind] / own
         squares, redundancy = weight * residual**2 / own, np.where(weight > 0.0, without.redundancy, 0.0)
         for kind in range(len(KINDS)):
             here = self.problem.kind == kind
             told, own_part = redundancy[here].sum(), (share * redundancy)[here].sum()
             ratio = (share * squares)[here].sum() / max(own_part, 1e-300)
-            self._kinds[kind] = _stepped(self._kinds[kind], ratio, told, own_part / max(told, 1e-300))
+            kinds[kind] = _stepped(kinds[kind], ratio, told, own_part / max(told, 1e-300))
         for component, (ratio, told) in enumerate(zip(*self._process_ratios(solution, inverse), strict=True)):
             if not self._fixed[component]:
-                factor = self._processes[component]
-                self._processes[component] = _stepped(factor, float(ratio), float(told), enough=self._enough)
-        after = np.concatenate([self._kinds, self._processes])
-        return float(np.abs(np.log(after / before)).max())
+                processes[component] = _stepped(processes[component], float(ratio), float(told), enough=self._enough)
+        return np.concatenate([kinds, processes])
+
+    def _factors(self) -> Float64:
+        """Returns the factors of all kinds, then of all processes."""
+        return np.concatenate([self._kinds, self._processes])
+
+    def _set_factors(self, factors: Float64) -> None:
+        self._kinds, self._processes = factors[: self._kinds.size].copy(), factors[self._kinds.size :].copy()
 
 
 def _stepped(

@@ -29,6 +29,8 @@ SURVEY: Final = len(KINDS)
 _HUBER_ROUNDS: Final = 10  # Rounds with Huber's weights before IGG III.
 _SETTLED: Final = 0.01
 """Weights, and logarithms of factors, that change by less are final."""
+_ROUGH: Final = 0.1
+"""Changes that are small enough for a decision on which σ hold; the result itself is settled."""
 _LEAST: Final = 1e-6
 """Weight of a rejected survey: the point is then free, but its coordinates stay determined."""
 _ENOUGH: Final = 30.0
@@ -114,9 +116,11 @@ class Rounds:
             residual = self._solved()[1]
             if self._moved_to(self.problem.groups.huber(residual / np.sqrt(self._own()))) < 10 * _SETTLED:
                 break
-        estimate = self._rounds(done)
         given = self.settings.estimate_variance_components is not None
-        return estimate, given or not self._is_understated(estimate)
+        estimate = self._rounds(done, _SETTLED if given else _ROUGH)
+        if given or self._is_understated(estimate):
+            return estimate, given
+        return self._rounds(estimate.rounds), True
 
     def without_surveys(self) -> Estimate:
         """Returns all rounds without the surveys of control points."""
@@ -125,7 +129,7 @@ class Rounds:
             return estimate
         # Ties that contradict poses of too small a σ look wrong themselves: poses are tested first.
         self._processes *= _FREE
-        freed = self._rounds(estimate.rounds)
+        freed = self._rounds(estimate.rounds, _ROUGH)
         if self._wide_kinds(freed).any():
             self._processes /= _FREE
             self._kinds = np.maximum(self._kinds, self._wide_kinds(estimate))
@@ -133,7 +137,7 @@ class Rounds:
             return self._rounds(freed.rounds)
         self._keep_stated(self._process_ratios(freed.solution, freed.inverse)[1] < _SOME)
         self._enough, self._estimating = _SOME, True
-        estimate = self._rounds(freed.rounds)
+        estimate = self._rounds(freed.rounds, _ROUGH)
         self._keep_stated(self._processes < _UNDERSTATED)
         self._keep_followers()
         return self._rounds(estimate.rounds)
@@ -174,13 +178,13 @@ class Rounds:
         self._weight[self._surveyed] = weight
         return self._rounds(done)
 
-    def _rounds(self, done: int) -> Estimate:
-        """Run rounds of IGG III after those that are done."""
+    def _rounds(self, done: int, until: float = _SETTLED) -> Estimate:
+        """Run rounds of IGG III after those that are done, until weights and factors change by less."""
         self._pace = Pace(self._weight.size)
         self._factor_pace = Pace(self._kinds.size + self._processes.size)
         for number in range(self.settings.max_rounds):
-            estimate = self._judged(done + number + 1)
-            if estimate.settled:
+            estimate, moved = self._judged(done + number + 1)
+            if moved < until:
                 break
         return estimate
 
@@ -221,8 +225,8 @@ class Rounds:
         solution = self._equations.solve(right)
         return solution, self._observed - rows.times(solution)
 
-    def _judged(self, rounds: int) -> Estimate:
-        """Run one round of IGG III; it is settled when its result equals its input."""
+    def _judged(self, rounds: int) -> tuple[Estimate, float]:
+        """Run one round of IGG III; returns its result, which is settled when it equals its input, and the change."""
         solution, residual = self._solved()
         inverse = self._equations.inverse()
         own, weight = self._own(), self._weight.copy()
@@ -235,7 +239,8 @@ class Rounds:
             way = np.log(self._new_factors(solution, inverse, residual, without, own, weight) / self._factors())
             moved = max(moved, float(np.abs(way).max()))
             self._set_factors(self._factors() * np.exp(self._factor_pace.step(way)))
-        return Estimate(solution, inverse, residual, weight, without, kinds, processes, rounds, moved < _SETTLED)
+        settled = moved < _SETTLED
+        return Estimate(solution, inverse, residual, weight, without, kinds, processes, rounds, settled), moved
 
     def _moved_to(self, weight: Float64) -> float:
         """Returns weights of the next round; one close to 0 becomes 0, so that 0 marks a row that does not count."""

@@ -136,7 +136,7 @@ def found_assets(session: Session) -> Found | None:
     records = {record.path: record for record in session.manifest.all()}
     for kind in asset_kind_names():
         file = f"{FOUND}/{asset_schema(kind).table}.parquet"
-        if store.exists(file):
+        if file in records or store.exists(file):  # one that was recorded and is gone is no survey without that kind
             content = read_recorded(store, records[file]) if file in records else store.read_bytes(file)
             tables[kind] = store.parse_table(content, file)
             digests.append(f"{kind}:{bytes_digest(content)}")

@@ -96,6 +96,9 @@ def test_found_assets_that_are_damaged_are_refused(tmp_path: Path) -> None:
     session.store.write_bytes(path, content.replace(b"station_m", b"station_l"))
     with pytest.raises(DamagedError, match="not as it was recorded"):
         found_assets(Session.open(survey_file))
+    session.store.remove(path)
+    with pytest.raises(DamagedError, match="missing from the store"):
+        found_assets(Session.open(survey_file))
 
 
 def processed(survey_file: Path) -> Inventory:

@@ -21,8 +21,8 @@ class Part(IntEnum):
 RINGS = (Part.RING_1, Part.RING_2, Part.RING_3)
 """The rings about a shaft, from its surface outwards."""
 _ON_IT, _BESIDE, _RING_1, _ON_LOWER, _NEAR_LOWER = 0, 1, 2, 5, 6  # as :class:`Part` has them
-_BELOW, _OVER, _GOES_ON, _LEAVES, _BUILDING = 9, 10, 11, 12, 14
-_LOW_VEGETATION, _HIGH_VEGETATION, _BUILDINGS = classes.LOW_VEGETATION, classes.HIGH_VEGETATION, classes.BUILDING
+_BELOW, _OVER, _GOES_ON, _LEAVES, _BUILDING = 9, 10, 11, 12, 14  # likewise
+_LEAVES_FROM, _LEAVES_TO = classes.LOW_VEGETATION, classes.HIGH_VEGETATION  # Classes between them are vegetation.
 _GRASS_M = 0.1  # Lower returns (m) are grass and the noise of the ground.
 _GOES_ON_M = 1.0  # A shaft goes on where returns lie on its axis up to so far above its top (m).
 
@@ -54,7 +54,7 @@ def about_shaft(returns, near, axis, heights, edges, slot_ns, number, sectors, o
         right, ahead = x[i] - (axis[0] + axis[3] * past), y[i] - (axis[1] + axis[4] * past)
         away = math.hypot(right, ahead) - axis[5]
         close, higher, half = away <= edges[2], above > top, 2 if above >= middle else 0
-        leaf, built = _LOW_VEGETATION <= kind[i] <= _HIGH_VEGETATION, kind[i] == _BUILDINGS
+        leaf, built = _LEAVES_FROM <= kind[i] <= _LEAVES_TO, kind[i] == classes.BUILDING
         number[_BELOW] += _GRASS_M < above < low and close
         number[_OVER] += higher and close
         number[_GOES_ON] += higher and away <= edges[0] and above < top + _GOES_ON_M

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +28,9 @@ from roadscan.assets.returns import Returns
 from roadscan.assets.scene import GroundModel, Scene
 from roadscan.compute.kernel_options import read_only
 from roadscan.compute.robust import scatter_about
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -144,6 +147,7 @@ def gains_of(samples: Sequence[IntensitySample]) -> pa.Table:
         return GAINS_SCHEMA.empty_table()
     terms = _terms_of(rows)
     columns, values = _design(rows, terms)
+    matrix = _matrix(columns, values, terms.unknowns)
     solution, covariance = np.zeros(terms.unknowns), np.zeros((terms.unknowns, terms.unknowns))
     robust, scale = np.ones(rows.place.size), 1.0
     for _ in range(_MOST_ROUNDS):
@@ -152,7 +156,7 @@ def gains_of(samples: Sequence[IntensitySample]) -> pa.Table:
         mean = _place_means(rows, response, robust)
         excess = np.clip(rows.intensity / mean - 1.0, *_EXCESS)
         weights = robust * np.minimum(rows.returns, 9) / (1.0 + (rows.unit / (2.0 * _SCATTER * mean)) ** 2)
-        solution, covariance = _solved(rows, (columns, values), (np.log(mean) + excess, weights), scale, terms)
+        solution, covariance = _solved(rows, matrix, (np.log(mean) + excess, weights), scale, terms)
         deviation = _without_places(rows, excess, weights)
         scale = max(scatter_about(deviation, 0.0), _LEAST_SCATTER)
         robust = 1.0 / (1.0 + (deviation / (3.0 * scale)) ** 2) ** 2
@@ -379,24 +383,31 @@ def _without_places(rows: IntensitySample, value: Float64, weights: Float64) -> 
     return out
 
 
+def _matrix(columns: Int64, values: Float64, unknowns: int) -> csr_array:
+    """Returns factors (m, 5) as a matrix (m, unknowns)."""
+    from scipy.sparse import csr_array
+
+    at = np.repeat(np.arange(len(columns)), columns.shape[1])
+    return csr_array((values.ravel(), (at, columns.ravel())), shape=(len(columns), unknowns))
+
+
 def _solved(
     rows: IntensitySample,
-    design: tuple[Int64, Float64],
+    matrix: csr_array,
     observed: tuple[Float64, Float64],
     scale: float,
     terms: _Terms,
 ) -> tuple[Float64, Float64]:
     """Returns unknowns and their covariance: normal equations without the places' reflectances, with the priors.
 
-    observed : (m,) logarithmic intensities and their weights.
+    matrix : (m, unknowns) the design. observed : (m,) logarithmic intensities and their weights.
     """
     from scipy import sparse
 
-    (columns, values), (value, weights) = design, observed
+    value, weights = observed
     size = rows.place.size
-    at = np.repeat(np.arange(size), 5)
-    matrix = sparse.csr_array((values.ravel(), (at, columns.ravel())), shape=(size, terms.unknowns))
-    in_place = sparse.csr_array((weights, (rows.place, np.arange(size))), shape=(int(rows.place.max()) + 1, size))
+    order, ends = np.argsort(rows.place, kind="stable"), np.cumsum(np.append(0, np.bincount(rows.place)))
+    in_place = sparse.csr_array((weights[order], order, ends), shape=(ends.size - 1, size))
     total = np.maximum(np.bincount(rows.place, weights=weights), 1e-12)
     sums = in_place @ matrix
     weighted = sparse.csr_array(matrix.multiply(weights[:, None]))

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from roadscan.assets.ground.grid import Grid, grid_over
 from roadscan.assets.kernels import columns
+from roadscan.assets.quantiles import quantiles
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
 from roadscan.core.extras import cv2
@@ -119,7 +120,7 @@ def tracks(held: Columns, moving: Bools) -> tuple[Int32, Int32]:
         top = held.top[part][inside]
         if cells < _TREE_CELLS and 2 * np.count_nonzero(top >= TALL) > cells:
             continue
-        reached = min(int(np.quantile(top, 0.9)) + 1, TALLEST)
+        reached = min(int(quantiles(top, [0.9])[0]) + 1, TALLEST)
         target = vehicle if sides_m(inside)[1] >= _PERSON_M else person
         wider = cv2.dilate(inside.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
         target[part][wider] = np.maximum(target[part][wider], reached)

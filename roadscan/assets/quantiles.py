@@ -11,7 +11,7 @@ import numpy.typing as npt
 Float64 = npt.NDArray[np.float64]
 
 
-def quantiles(values: Float64, shares: Sequence[float]) -> list[float]:
+def quantiles(values: npt.NDArray[np.number[Any]], shares: Sequence[float]) -> list[float]:
     """Returns the numbers below which these shares of values (n,) lie, interpolated; values are finite, n ≥ 1."""
     last = values.size - 1
     places = [last * share for share in shares]
@@ -26,7 +26,7 @@ def quantiles(values: Float64, shares: Sequence[float]) -> list[float]:
     return found
 
 
-def median(values: Float64) -> float:
+def median(values: npt.NDArray[np.number[Any]]) -> float:
     """Returns the median of values (n,); they are finite, n ≥ 1."""
     half = values.size // 2
     if values.size % 2:

@@ -21,6 +21,7 @@ from roadscan.assets.moving import (
     sides_m,
     tracks,
 )
+from roadscan.assets.quantiles import quantiles
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
 from roadscan.core.extras import cv2
@@ -156,10 +157,10 @@ def _plan_of(raster: Columns, label: Int32, number: int, part: tuple[slice, slic
     at_top = np.zeros(inside.shape, np.bool_)
     at_top[inside] = at_windows
     upper_m = sides_m(at_top) if at_top.any() else (0.0, 0.0)
-    quantiles = np.quantile(top, [0.1, 0.5, 0.9, 1.0])
-    low, middle, high, highest = (float(q + 1.0) * LEVEL_M for q in quantiles)
+    reached = quantiles(top, [0.1, 0.5, 0.9, 1.0])
+    low, middle, high, highest = ((level + 1.0) * LEVEL_M for level in reached)
     return {
-        "reached": float(int(quantiles[2]) + 1),
+        "reached": float(int(reached[2]) + 1),
         "length_m": length_m, "width_m": width_m, "top_m": high, "middle_top_m": middle, "low_top_m": low,
         "highest_m": highest, "fill": cells * CELL_M**2 / (length_m * width_m),
         "ground_around": ground_around(inside, grounds),

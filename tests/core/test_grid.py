@@ -5,6 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
+from roadscan.assets.tasks.plan import cut_squares
 from roadscan.core.grid import Bounds, TileGrid
 from roadscan.core.ids import TileId
 from roadscan.tiles.blocks import Block, cut_blocks
@@ -43,6 +44,19 @@ def test_blocks_hold_every_tile_once(readings: dict[TileId, int], edge: int, lim
         box = block.box()
         assert box[2] - box[0] <= edge
         assert len(block.tiles) == 1 or sum(readings[t] for t in block.tiles) <= limit
+
+
+@given(tiles, st.integers(1, 64), st.integers(1, 50_000))
+def test_squares_that_fit_into_one_block_are_one_wherever_they_lie(
+    readings: dict[TileId, int], edge: int, limit: int
+) -> None:
+    blocks = cut_squares(readings, edge, limit)
+    assert sorted(t for block in blocks for t in block) == sorted(readings)
+    spans = [max(at) - min(at) < edge for at in zip(*readings, strict=True)]
+    for block in blocks:
+        assert all(max(at) - min(at) < edge for at in zip(*block, strict=True))
+    if all(spans) and sum(readings.values()) <= limit:
+        assert len(blocks) == 1
 
 
 def test_halo_surrounds_each_tile() -> None:

@@ -177,3 +177,27 @@ def test_a_walk_ends_at_what_stands_and_at_an_edge() -> None:
     assert out[:, END].tolist() == [OBSTACLE, STEP_DOWN, UNSEEN]
     assert out[:, WIDTH] == pytest.approx([3.4, 2.5, 3.9], abs=0.11)
     assert out[:, SLOPE] == pytest.approx([0.02, 0.02, 0.02], abs=1e-6)
+
+
+def test_the_best_ways_are_those_over_all_places_in_their_order() -> None:
+    draw = np.random.default_rng(4)
+    n = 300
+    links, lengths, gains = np.full((n, MAX_LINKS), -1), np.zeros((n, MAX_LINKS)), np.zeros((n, MAX_LINKS))
+    for i in range(n - 1):
+        to = np.unique(np.minimum(i + draw.integers(1, 20, draw.integers(0, MAX_LINKS)), n - 1))
+        links[i, : to.size], lengths[i, : to.size] = to, draw.uniform(0.1, 1.5, to.size)
+        gains[i, : to.size] = draw.normal(0.0, 1.0, to.size)
+    ahead, behind = np.zeros(n), np.zeros(n)
+    following, preceding = np.full(n, -1), np.full(n, -1)
+    best_ways(links, lengths, gains, 6.0, n, ahead, following, behind, preceding)
+    first, last = np.zeros(n), np.zeros(n)  # all links lead on: each place once tells
+    for i in range(n - 1, -1, -1):
+        for k in np.flatnonzero(links[i] >= 0).tolist():
+            first[i] = max(first[i], gains[i, k] + first[links[i, k]] * np.exp(-lengths[i, k] / 6.0))
+    for i in range(n):
+        for k in np.flatnonzero(links[i] >= 0).tolist():
+            j = links[i, k]
+            last[j] = max(last[j], gains[i, k] + last[i] * np.exp(-lengths[i, k] / 6.0))
+    np.testing.assert_allclose(ahead, first, atol=5e-3)
+    np.testing.assert_allclose(behind, last, atol=5e-3)
+    assert ((following >= 0) == (ahead > 0)).all() and ((preceding >= 0) == (behind > 0)).all()

@@ -6,11 +6,19 @@ from itertools import pairwise
 
 import numpy as np
 from scipy.ndimage import binary_propagation
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
+from roadscan.assets import classes
+from roadscan.assets.bins import cells_of, in_bins
+from roadscan.assets.covers.kernels.grown import grow_spot
 from roadscan.assets.ground.kernels.breaks import drops_on_both_sides, grow
 from roadscan.assets.judgement.kernels.boosted_trees import tree_sums
 from roadscan.assets.kernels.buckets import sort_groups
-from roadscan.assets.upright.kernels.shafts import longest_run, near_axis, widths_of_levels
+from roadscan.assets.kernels.filling import relax
+from roadscan.assets.upright.kernels.about_shaft import Part, about_shaft
+from roadscan.assets.upright.kernels.shafts import longest_run, near_axis, returns_about, widths_of_levels
 
 
 def test_each_row_gets_the_leaves_that_it_reaches() -> None:
@@ -93,3 +101,90 @@ def test_widths_of_levels_are_those_of_quantiles() -> None:
         box = np.ptp(np.quantile(xyh[level == k, :2], [0.1, 0.9], axis=0), axis=0)
         np.testing.assert_allclose(widths[k], np.hypot(*box))
     assert widths[4] == -1.0
+
+
+def test_a_spot_grows_over_what_hangs_together_with_its_square() -> None:
+    """A bright disc, a bright place apart from it, and noise: as SciPy's trees and graphs tell them."""
+    draw = np.random.default_rng(5)
+    xy, place, half = draw.uniform(0.0, 3.0, (4000, 2)), np.array([1.5, 1.4]), 0.25
+    bright = (np.hypot(*(xy - [1.55, 1.45]).T) < 0.32) | (np.hypot(*(xy - [1.95, 1.87]).T) < 0.13)
+    value = bright + draw.normal(0.0, 0.4, len(xy))
+    x, y = xy.T.copy()
+    buckets, grid = in_bins(cells_of(x, y, (0.0, 0.0, 0.5), (6, 6)), 36), (0.0, 0.0, 0.5, 6, 6)
+    limits, square = (1.0, 0.12, 0.1, 0.25, 4), (1.5, 1.4, half)
+    near, inside = grow_spot(x, y, value, buckets, grid, square, limits, (0.9, 0.75))
+    assert near.tolist() == sorted(cKDTree(xy).query_ball_point(place, 1.0))
+    own, v = xy[near], value[near]
+    first, second = cKDTree(own).query_pairs(0.12, output_type="ndarray").T
+    mean, number = v.copy(), np.ones(v.size)
+    for a, b in ((first, second), (second, first)):
+        np.add.at(mean, a, v[b])
+        np.add.at(number, a, 1.0)
+    mean /= number
+    away = np.abs(own - place).max(axis=1)
+    limit = (np.quantile(mean[away <= half], 0.9) + np.quantile(mean[away >= half + 0.1], 0.75)) / 2
+    belongs = (mean >= limit) & (away <= half + 0.25)
+    held = belongs[first] & belongs[second]
+    links = coo_array((np.ones(held.sum()), (first[held], second[held])), (v.size, v.size))
+    label = connected_components(links, directed=False)[1]
+    expected = belongs & np.isin(label, label[belongs & (away <= half)])
+    assert (inside == expected).all() and 50 < inside.sum() < belongs.sum()
+    few = (*limits[:4], 10_000)
+    assert not grow_spot(x, y, value, buckets, grid, square, few, (0.9, 0.75))[1].any()
+
+
+def test_eight_sweeps_of_relaxation_are_those_of_gauss_and_seidel_one_by_one() -> None:
+    draw = np.random.default_rng(6)
+    for shape in ((40, 7), (3, 9), (1, 5), (18, 1)):
+        z, known = draw.normal(size=shape).astype(np.float32), draw.random(shape) < 0.2
+        found = z.copy()
+        relax(found, known)
+        for _ in range(8):
+            for i, j in np.argwhere(~known).tolist():
+                south, north = z[max(i - 1, 0), j], z[min(i + 1, shape[0] - 1), j]
+                west, east = z[i, max(j - 1, 0)], z[i, min(j + 1, shape[1] - 1)]
+                z[i, j] = np.float32(0.25) * (south + north + west + east)
+        assert (found == z).all()
+
+
+def test_what_is_about_a_shaft_is_counted_as_numpy_does() -> None:
+    draw = np.random.default_rng(7)
+    n, slot = 3000, 100
+    x, y, height = draw.normal(5.0, 0.5, n), draw.normal(2.0, 0.5, n), draw.uniform(9.8, 16.0, n)
+    x[:400], y[:400] = draw.normal(5.0, 0.05, 400), draw.normal(2.0, 0.05, 400)
+    kind = draw.choice(np.array([classes.HIGH_VEGETATION, classes.BUILDING, classes.UNCLASSIFIED], np.uint8), n)
+    epoch, near = draw.integers(0, 4000, n), np.sort(draw.permutation(n)[:2500])
+    number, sectors = np.zeros(len(Part), np.int64), np.zeros(8, np.int64)
+    on_it, slots = np.empty((near.size, 3)), np.zeros(2, np.int64)
+    axis, heights, edges = (5.0, 2.0, 11.0, 0.02, -0.01, 0.06), (10.0, 0.4, 4.0), (0.1, 0.35, 0.6, 1.2)
+    returns = (x, y, height, kind, epoch)
+    about_shaft(returns, near, axis, heights, edges, slot, number, sectors, on_it, slots)
+    h, above, kind, time = height[near], height[near] - 10.0, kind[near], epoch[near] // slot
+    right, ahead = x[near] - 5.0 - 0.02 * (h - 11.0), y[near] - 2.0 + 0.01 * (h - 11.0)
+    away = np.hypot(right, ahead) - 0.06
+    beside, higher, close = (above >= 0.4) & (above <= 4.0), above > 4.0, away <= 0.6
+    own, upper = beside & (away <= 0.1), above >= 2.2
+    leaf, built = kind == classes.HIGH_VEGETATION, kind == classes.BUILDING
+    expected = {
+        Part.ON_IT: own, Part.BESIDE: beside, Part.RING_1: beside & (away > 0.1) & (away <= 0.35),
+        Part.RING_2: beside & (away > 0.35) & close, Part.RING_3: beside & ~close & (away <= 1.2),
+        Part.ON_LOWER: own & ~upper, Part.NEAR_LOWER: beside & close & ~upper, Part.ON_UPPER: own & upper,
+        Part.NEAR_UPPER: beside & close & upper, Part.BELOW: (above > 0.1) & (above < 0.4) & close,
+        Part.OVER: higher & close, Part.GOES_ON: higher & (away <= 0.1) & (above < 5.0),
+        Part.LEAVES: beside & leaf, Part.OWN_LEAVES: own & leaf,
+        Part.BUILDING: beside & built, Part.OWN_BUILDING: own & built,
+    }  # fmt: skip
+    assert set(expected) == set(Part) and all(some.any() for some in expected.values())
+    assert [int(number[part]) for part in Part] == [int(expected[part].sum()) for part in Part]
+    np.testing.assert_allclose(on_it[: own.sum()], np.column_stack([right, ahead, above])[own], atol=1e-12)
+    sector = np.floor(np.arctan2(ahead, right) / (np.pi / 4)).astype(np.int64)[beside & ~own] % 8
+    assert sectors.tolist() == np.bincount(sector, minlength=8).tolist()
+    seen = np.unique(time[own])
+    assert slots.tolist() == [seen.size, np.setdiff1d(time[higher | (beside & ~own)], seen).size]
+
+
+def test_returns_about_a_place_in_each_of_some_slices_once() -> None:
+    counts = np.random.default_rng(8).integers(0, 9, (60, 13, 13)).astype(np.uint16)
+    dy, dx = np.mgrid[-6:7, -6:7] * 0.1
+    inside = np.hypot(dx, dy) <= 0.45
+    assert returns_about(counts, np.array([3, 59, 3, 4]), 0.1, 0.45) == int(counts[[3, 4, 59]][:, inside].sum())

@@ -9,13 +9,14 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from roadscan.assets import classes
+from roadscan.assets.bins import cells_of, in_bins
+from roadscan.assets.covers.kernels.grown import grow_spot
 from roadscan.assets.paint.contrast import Contrast
 from roadscan.assets.paint.detection import paint_of
+from roadscan.assets.quantiles import median
 from roadscan.assets.scene import Scene
 from roadscan.core.extras import cv2
 
@@ -51,6 +52,7 @@ _FARTHEST_M: Final = 15.0
 """Spots are sought up to this distance (m) from a drive."""
 _RIM_M: Final = (0.02, 0.1)
 """On both sides of a spot's edge, returns between these distances tell how sharp it is (m): patches fade."""
+_BUCKET_M: Final = 0.5  # Edge of the cells by which returns near a place are found (m).
 _QUARTERS: Final = 4
 """Parts of a ring, each beside a part of the spot: an edge of paint is told by those that do not differ."""
 
@@ -89,59 +91,84 @@ class Ground:
         return Ground(self.xy_m[chosen], self.height_m[chosen], self.value[chosen], self.on_road[chosen])
 
 
+_Buckets = tuple[tuple[Int64, Int64], tuple[float, float, float, int, int]]
+
+
 def spots_of(scene: Scene) -> list[Spot]:
     """Returns the spots whose middle lies in the scene's tile, by their place."""
     contrast = paint_of(scene).contrast
-    found = [spot for sign in (1.0, -1.0) for spot in _of_sign(scene, contrast, sign)]
+    buckets = _bucketed(contrast)
+    both = zip((1.0, -1.0), _squares(contrast), strict=True)
+    found = [spot for sign, places in both for spot in _of_sign(scene, contrast, buckets, sign, places)]
     return sorted(found, key=lambda one: (one.x_m, one.y_m))
 
 
-def _of_sign(scene: Scene, contrast: Contrast, sign: float) -> list[Spot]:
-    """Returns bright (1) or dark (−1) spots."""
-    places = _squares(contrast, sign)
+def _of_sign(scene: Scene, contrast: Contrast, buckets: _Buckets, sign: float, places: Float64) -> list[Spot]:
+    """Returns the bright (1) or dark (−1) spots in some squares (n, 3)."""
     if not len(places):
         return []
-    away = _to_drive(scene, places[:, :2])
-    places, away = places[away <= _FARTHEST_M], away[away <= _FARTHEST_M]
+    reach = places[:, 2] / 2 + _GROWS_M
+    # a middle lies among its returns: what reaches no place of the tile belongs to another tile
+    away, t = _to_drive(scene, places[:, :2]), scene.tile
+    x, y = places[:, 0], places[:, 1]
+    own = (x + reach >= t.x_min_m) & (x - reach < t.x_max_m) & (y + reach >= t.y_min_m) & (y - reach < t.y_max_m)
+    own &= away <= _FARTHEST_M
     ground = Ground(
         np.column_stack([contrast.x_m, contrast.y_m]), contrast.height_m, sign * contrast.contrast,
         scene.classes[contrast.rows] == classes.ROAD,
     )  # fmt: skip
-    about = cKDTree(ground.xy_m).query_ball_point(places[:, :2], _REACH_M + sum(_RING_M), return_sorted=True)
     found = []
-    for place, to_drive, near in zip(places.tolist(), away.tolist(), about, strict=True):
-        rows = np.asarray(near, np.int64)
-        spot = _measured(ground.at(rows), contrast.rows[rows], (place[0], place[1]), place[2])
+    for (east, north, side), to_drive in zip(places[own].tolist(), away[own].tolist(), strict=True):
+        near, inside = grow_spot(
+            contrast.x_m, contrast.y_m, ground.value, *buckets, (east, north, side / 2),
+            (_REACH_M + sum(_RING_M), _SMOOTH_M, _GAP_M, _GROWS_M, _FEWEST // 2), (_CORE, _BESIDE),
+        )  # fmt: skip
+        spot = _measured(ground.at(near), inside, contrast.rows[near])
         if spot is not None and bool(scene.tile.holds(spot.x_m, spot.y_m)):
             found.append(replace(spot, features={**spot.features, "sign": sign, "to_drive_m": to_drive}))
     return found
 
 
-def _squares(contrast: Contrast, sign: float) -> Float64:
-    """Returns (n, 3) x and y of the middle (m), and side (m), of squares that differ from what lies around them."""
+def _bucketed(contrast: Contrast) -> _Buckets:
+    """Returns returns by cells of 0.5 m, and these cells, as :func:`grow_spot` takes them."""
+    box = contrast.box
+    rows, columns = (math.ceil(side / _BUCKET_M) for side in (box.y_max_m - box.y_min_m, box.x_max_m - box.x_min_m))
+    cell = cells_of(contrast.x_m, contrast.y_m, (float(box.x_min_m), float(box.y_min_m), _BUCKET_M), (rows, columns))
+    return in_bins(cell, rows * columns), (float(box.x_min_m), float(box.y_min_m), _BUCKET_M, rows, columns)
+
+
+def _squares(contrast: Contrast) -> list[Float64]:
+    """Returns (n, 3) x and y of the middle, and side (m), of squares brighter than around them, and of darker ones."""
     box = contrast.box
     shape = (round((box.y_max_m - box.y_min_m) / _CELL_M), round((box.x_max_m - box.x_min_m) / _CELL_M))
     column = np.clip(((contrast.x_m - box.x_min_m) / _CELL_M).astype(np.int64), 0, shape[1] - 1)
     row = np.clip(((contrast.y_m - box.y_min_m) / _CELL_M).astype(np.int64), 0, shape[0] - 1)
-    cell, value = row * shape[1] + column, sign * contrast.contrast
+    cell, value = row * shape[1] + column, contrast.contrast
     sums = [np.bincount(cell, weight, shape[0] * shape[1]).reshape(shape).astype(np.float32)
             for weight in (np.ones(cell.size), value, value * value)]  # fmt: skip
-    best, size = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    best, size = np.zeros((2, *shape), np.float32), np.zeros((2, *shape), np.float32)
     for side in _SIDES_M:
-        n, s, _ = (_summed(one, side) for one in sums)
+        n, s = (_summed(one, side) for one in sums[:2])
         gap, frame = side + 2 * _GAP_M, side + 2 * (_GAP_M + _FRAME_M)
         m, t, tt = (_summed(one, frame) - _summed(one, gap) for one in sums)
         known = (n >= _FEWEST) & (m >= _FEWEST)
         n, m = np.maximum(n, 1.0), np.maximum(m, 1.0)
         differs = s / n - t / m
         variance = np.maximum(tt / m - (t / m) ** 2, 1e-4)
-        evidence = np.where(known & (differs >= _CONTRAST), differs / np.sqrt(variance * (1.0 / n + 1.0 / m)), 0.0)
-        size = np.where(evidence > best, np.float32(side), size)
-        best = np.maximum(best, evidence)
+        evidence = np.where(
+            known & (np.abs(differs) >= _CONTRAST), differs / np.sqrt(variance * (1.0 / n + 1.0 / m)), 0.0
+        )
+        for k, own in enumerate((evidence, -evidence)):
+            size[k] = np.where(own > best[k], np.float32(side), size[k])
+            best[k] = np.maximum(best[k], own)
     reach = 2 * round(_APART_M / _CELL_M) + 1
-    peak = (best >= _SIGMA) & (best >= cv2.dilate(best, np.ones((reach, reach), np.uint8)))
-    row, column = np.nonzero(peak)
-    return np.column_stack([box.x_min_m + (column + 0.5) * _CELL_M, box.y_min_m + (row + 0.5) * _CELL_M, size[peak]])
+    found = []
+    for k in range(2):
+        peak = (best[k] >= _SIGMA) & (best[k] >= cv2.dilate(best[k], np.ones((reach, reach), np.uint8)))
+        row, column = np.nonzero(peak)
+        x, y = box.x_min_m + (column + 0.5) * _CELL_M, box.y_min_m + (row + 0.5) * _CELL_M
+        found.append(np.column_stack([x, y, size[k][peak]]))
+    return found
 
 
 def _summed(values: npt.NDArray[np.float32], side_m: float) -> npt.NDArray[np.float32]:
@@ -150,9 +177,8 @@ def _summed(values: npt.NDArray[np.float32], side_m: float) -> npt.NDArray[np.fl
     return np.asarray(cv2.boxFilter(values, cv2.CV_32F, (side, side), None, (-1, -1), False, cv2.BORDER_CONSTANT))
 
 
-def _measured(near: Ground, rows: Int64, place: tuple[float, float], side: float) -> Spot | None:
-    """Returns the spot in a square, of the returns `near` it, `rows` of the scene; None where they are few."""
-    inside = _grown(near, place, side)
+def _measured(near: Ground, inside: npt.NDArray[np.bool_], rows: Int64) -> Spot | None:
+    """Returns the spot of those `inside` it, of the returns `near` it, `rows` of the scene; None where they are few."""
     if np.count_nonzero(inside) < _FEWEST:
         return None
     own = near.at(inside)
@@ -188,35 +214,12 @@ def _measured(near: Ground, rows: Int64, place: tuple[float, float], side: float
         "length_m": length, "slim": length / width, "diameter_m": diameter,
         "filled": own.value.size / max(int(np.count_nonzero(away <= 0.0)), 1),
         "density": (own.value.size / diameter**2) / (ring.value.size / (diameter + sum(_RING_M))),
-        "rise_m": float(np.median(rise)), "rough_m": float(np.std(rough)), "rough_inside_m": float(np.std(rise)),
+        "rise_m": median(rise), "rough_m": float(np.std(rough)), "rough_inside_m": float(np.std(rise)),
         "road": float(ring.on_road.mean()), "road_inside": float(own.on_road.mean()),
     }  # fmt: skip
     along = axes[:, 1]
     heading = math.degrees(math.atan2(along[0], along[1])) % 180.0
     return Spot(rows[inside], float(middle[0]), float(middle[1]), length, width, diameter, heading, features)
-
-
-def _grown(near: Ground, place: tuple[float, float], side: float) -> npt.NDArray[np.bool_]:
-    """Returns a mask (n,) of the returns that differ as those in the square do, and that hang together with it.
-
-    The value of a return is the mean over its neighbours, so that noise makes no holes. It belongs to the spot where
-    that is nearer to the square's value than to that of what lies around.
-    """
-    away = np.abs(near.xy_m - place).max(axis=1)
-    core, beside = away <= side / 2, away >= side / 2 + _GAP_M
-    if np.count_nonzero(core) < _FEWEST // 2 or not beside.any():
-        return np.zeros(away.size, np.bool_)
-    first, second = cKDTree(near.xy_m).query_pairs(_SMOOTH_M, output_type="ndarray").T
-    own, size = near.value, away.size
-    number = 1.0 + np.bincount(first, minlength=size) + np.bincount(second, minlength=size)
-    mean = own + np.bincount(first, own[second], size) + np.bincount(second, own[first], size)
-    mean /= number
-    half = (np.quantile(mean[core], _CORE) + np.quantile(mean[beside], _BESIDE)) / 2
-    belongs = (mean >= half) & (away <= side / 2 + _GROWS_M)
-    joined = belongs[first] & belongs[second]
-    links = coo_array((np.ones(np.count_nonzero(joined)), (first[joined], second[joined])), (size, size))
-    _, label = connected_components(links, directed=False)
-    return np.asarray(belongs & np.isin(label, label[core & belongs]))
 
 
 def _by_quarter(middle: Float64, inside: Ground, ring: Ground) -> Float64:

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from roadscan.assets import classes
 from roadscan.assets.bins import in_bins
 from roadscan.assets.memory import once_a_scene
+from roadscan.assets.quantiles import quantiles
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.brightness import brightness
 from roadscan.assets.upright.regions import regions_of
@@ -124,15 +125,16 @@ def _forms(scene: Scene, rows: Int64) -> Float64:
 def _measured(scene: Scene, rows: Int64, form: Float64) -> Compact | None:
     """Returns a thing; None where it has not the size of any, or stands elsewhere."""
     returns, above = scene.returns, scene.above_ground_m[rows]
-    low, high = np.quantile(above, [_TRIMMED, 1.0 - _TRIMMED])
-    if low > _FOOT_M or above.max() > _TOP_M:
-        return None
     xy = np.column_stack([returns.x_m[rows], returns.y_m[rows]])
-    if np.ptp(xy, axis=0).max() > _LONGEST_M:
+    longest = float(np.ptp(xy, axis=0).max())
+    if longest > _LONGEST_M or above.max() > _TOP_M or not scene.tile.comes_near(xy, longest):
+        return None
+    low, high = np.quantile(above, [_TRIMMED, 1.0 - _TRIMMED])
+    if low > _FOOT_M:
         return None
     way = _narrowest(xy)
     turned = xy @ np.column_stack([way, [-way[1], way[0]]])
-    ends = np.quantile(turned, [_TRIMMED, 1.0 - _TRIMMED], axis=0)
+    ends = np.array([quantiles(one, [_TRIMMED, 1.0 - _TRIMMED]) for one in turned.T]).T
     length, width = (float(v) for v in ends[1] - ends[0])
     x, y = (float(v) for v in np.column_stack([way, [-way[1], way[0]]]) @ ends.mean(axis=0))
     if not bool(scene.tile.holds(x, y)):

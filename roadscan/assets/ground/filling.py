@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 import numpy.typing as npt
 
@@ -12,9 +10,6 @@ from roadscan.core.extras import cv2
 
 Float32 = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]
-
-_SWEEPS: Final = 8
-"""Sweeps of relaxation a level: the membrane is wrong by less than a hundredth of the fall across a hole."""
 
 
 def filled(height_m: Float32, known: Bools) -> Float32:
@@ -30,7 +25,7 @@ def filled(height_m: Float32, known: Bools) -> Float32:
         coarse, coarse_known = np.empty(shape, np.float32), np.empty(shape, np.bool_)
         halved(z, known, coarse, coarse_known)
         begin(filled(coarse, coarse_known), known, z)
-        relax(z, known, _SWEEPS)
+        relax(z, known)
     return z
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from roadscan.compute.kernel_options import inlined, kernel
+from roadscan.compute.kernel_options import inlined, inner, kernel
 
 MAX_LINKS = 12
 """Most links from a place."""
@@ -83,46 +83,68 @@ def best_ways(links, lengths, gains, memory_m, rounds, ahead, following, behind,
     following, preceding : (n,) the next place of the best way, −1 where it ends.
     """
     n = ahead.size
-    new, fade = np.zeros(n), np.empty(lengths.shape)
+    starts, begins = np.zeros(n + 1, np.int64), np.zeros(n + 1, np.int64)
     for i in range(n):
         for k in range(links.shape[1]):
-            fade[i, k] = np.exp(-lengths[i, k] / memory_m)
+            if links[i, k] < 0:
+                break
+            starts[i + 1] += 1
+            begins[links[i, k] + 1] += 1
+    for i in range(n):
+        starts[i + 1] += starts[i]
+        begins[i + 1] += begins[i]
+    to, gain, fade = np.empty(starts[n], np.int64), np.empty(starts[n]), np.empty(starts[n])
+    back_to, back_gain, back_fade = np.empty(starts[n], np.int64), np.empty(starts[n]), np.empty(starts[n])
+    at = begins.copy()
+    for i in range(n):
+        for m in range(starts[i], starts[i + 1]):
+            k = m - starts[i]
+            to[m], gain[m], fade[m] = links[i, k], gains[i, k], np.exp(-lengths[i, k] / memory_m)
+            back = at[to[m]]
+            back_to[back], back_gain[back], back_fade[back] = i, gain[m], fade[m]
+            at[to[m]] += 1
+    _spread((starts, to, gain, fade), (begins, back_to), rounds, ahead, following)
+    _spread((begins, back_to, back_gain, back_fade), (starts, to), rounds, behind, preceding)
+
+
+@inner
+def _spread(ways, back, rounds, value, following):
+    """Fill `value` (n,), the evidence of the best path from each place, and `following`, the next place on it.
+
+    A round looks again at the places from which a way leads to one whose value the round before has changed.
+    ways : beginnings of the links of each place, and of each link its end, gain and share of what lies beyond.
+    back : beginnings and ends of the links in the other direction.
+    """
+    starts, to, gain, fade = ways
+    begins, back_to = back
+    n = value.size
+    due, new, waiting = np.arange(n), np.empty(n), np.empty(n, np.bool_)
+    count = n
     for _ in range(rounds):
-        changed = False
-        for i in range(n):
+        waiting[:] = False
+        for d in range(count):
+            i = due[d]
             best, then = 0.0, -1
-            for k in range(links.shape[1]):
-                j = links[i, k]
-                if j < 0:
-                    break
-                value = gains[i, k] + ahead[j] * fade[i, k]
-                if value > best:
-                    best, then = value, j
-            new[i] = best
-            following[i] = then
-        for i in range(n):
-            changed = changed or new[i] > ahead[i] + 1e-3
-            ahead[i] = new[i]
-        if not changed:
-            break
-    for _ in range(rounds):
-        new[:] = 0.0
-        preceding[:] = -1
-        for i in range(n):
-            for k in range(links.shape[1]):
-                j = links[i, k]
-                if j < 0:
-                    break
-                value = gains[i, k] + behind[i] * fade[i, k]
-                if value > new[j]:
-                    new[j] = value
-                    preceding[j] = i
+            for m in range(starts[i], starts[i + 1]):
+                some = gain[m] + value[to[m]] * fade[m]
+                if some > best:
+                    best, then = some, to[m]
+            new[d], following[i] = best, then
         changed = False
-        for i in range(n):
-            changed = changed or new[i] > behind[i] + 1e-3
-            behind[i] = new[i]
+        for d in range(count):
+            i = due[d]
+            changed = changed or new[d] > value[i] + 1e-3
+            if new[d] != value[i]:
+                value[i] = new[d]
+                for m in range(begins[i], begins[i + 1]):
+                    waiting[back_to[m]] = True
         if not changed:
             break
+        count = 0
+        for i in range(n):
+            if waiting[i]:
+                due[count] = i
+                count += 1
 
 
 @kernel

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from roadscan.compute.kernel_options import kernel
+import numpy as np
+
+from roadscan.compute.kernel_options import inlined, kernel
+
+SWEEPS = 8
+"""Sweeps of relaxation: with a level for each size of holes, the membrane is wrong by less than a hundredth of the fall
+across a hole."""
 
 
 @kernel
@@ -44,16 +50,41 @@ def begin(coarse, known, z):
 
 
 @kernel
-def relax(z, known, times):
-    """Replace each unknown cell by the mean of its four neighbours, row by row, `times` over (Gauss–Seidel).
+def relax(z, known):
+    """Replace each unknown cell by the mean of its four neighbours, row by row, eight times over (Gauss–Seidel).
 
+    A mean waits for that of the cell to its west. So the eight sweeps go over the raster together, each two rows behind
+    the one before: it finds there what that left, and the processor works on eight means at once.
     z : (rows, columns) float32, changed; known : (rows, columns) bool. The slope across the grid's edge is zero.
     """
+    rows = z.shape[0]
+    for front in range(rows + 2 * SWEEPS - 2):
+        if 2 * SWEEPS - 2 < front < rows - 1:
+            _relax_eight(z, known, front)
+        else:
+            for sweep in range(SWEEPS):
+                _relax_row(z, known, front - 2 * sweep)
+
+
+@inlined
+def _relax_row(z, known, i):
+    """Replace the unknown cells of a row, where the raster has it."""
     rows, columns = z.shape
-    for _ in range(times):
-        for i in range(rows):
-            south, north = max(i - 1, 0), min(i + 1, rows - 1)
-            for j in range(columns):
-                if not known[i, j]:
-                    west, east = max(j - 1, 0), min(j + 1, columns - 1)
-                    z[i, j] = 0.25 * (z[south, j] + z[north, j] + z[i, west] + z[i, east])
+    if 0 <= i < rows:
+        south, north = max(i - 1, 0), min(i + 1, rows - 1)
+        for j in range(columns):
+            if not known[i, j]:
+                west, east = max(j - 1, 0), min(j + 1, columns - 1)
+                z[i, j] = 0.25 * (z[south, j] + z[north, j] + z[i, west] + z[i, east])
+
+
+@inlined
+def _relax_eight(z, known, front):
+    """Replace the unknown cells of eight rows, each two south of the one before, none at an edge of the raster."""
+    columns = z.shape[1]
+    for j in range(columns):
+        west, east = max(j - 1, 0), min(j + 1, columns - 1)
+        for sweep in range(SWEEPS):
+            i = front - 2 * sweep
+            mean = np.float32(0.25) * (z[i - 1, j] + z[i + 1, j] + z[i, west] + z[i, east])
+            z[i, j] = z[i, j] if known[i, j] else mean

@@ -183,12 +183,12 @@ def near_middles(t, d, stretch, edges, middle, most_m, near):
 
 
 @kernel
-def passing_lines(x, y, height, sensor_x, sensor_y, sensor_height, segments, passed):
+def passing_lines(x, y, height, sensor_x, sensor_y, sensor_height, segments, bands, passed):
     """Count the sight lines that cross upright rectangles and end behind them.
 
     x, y, height : (n,) returns; sensor_x, sensor_y, sensor_height : (n,) where they were seen from (m); segments :
-    (s, 6) ends x, y and x, y of a rectangle seen from above, height of its lower and of its upper edge; passed : (s,)
-    int64, is added to.
+    (s, 4) ends x, y and x, y of rectangles seen from above; bands : (s, b, 2) heights of the lower and upper edges of b
+    rectangles above one another; passed : (s, b) int64, is added to.
     """
     for s in range(segments.shape[0]):
         ax, ay, bx, by = segments[s, 0], segments[s, 1], segments[s, 2], segments[s, 3]
@@ -208,8 +208,8 @@ def passing_lines(x, y, height, sensor_x, sensor_y, sensor_height, segments, pas
             if along < 0.0 or along > length:
                 continue
             crossing = sensor_height[i] + share * (height[i] - sensor_height[i])
-            if segments[s, 4] <= crossing <= segments[s, 5]:
-                passed[s] += 1
+            for b in range(bands.shape[1]):
+                passed[s, b] += bands[s, b, 0] <= crossing <= bands[s, b, 1]
 
 
 @kernel

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from roadscan.assets.paint.components import SEED_CONTRAST, Component
 from roadscan.assets.paint.contrast import CELL_M, Contrast
 from roadscan.assets.paint.road_direction import RoadDirection
+from roadscan.assets.quantiles import median
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -212,8 +213,8 @@ def _is_an_edge(found: Contrast, component: Component, stripe: Stripe) -> bool:
     heights, levels = [], []
     for mine in (beyond <= 0, (across > 0) & (beyond > _EDGE_M), (across < 0) & (beyond > _EDGE_M)):
         there = near[within & mine & (beyond <= _BESIDE_M)]
-        heights.append(float(np.median(found.height_m[there])) if there.size >= 3 else np.nan)
-        levels.append(float(np.median(found.contrast[there])) if there.size >= 3 else np.nan)
+        heights.append(median(found.height_m[there]) if there.size >= 3 else np.nan)
+        levels.append(median(found.contrast[there]) if there.size >= 3 else np.nan)
     inside, left, right = heights
     bend, slope = abs((left + right) / 2 - inside), abs(left - right) / (stripe.width_m + _EDGE_M + _BESIDE_M)
     lone = max(np.nan_to_num(abs(left - inside)), np.nan_to_num(abs(right - inside)))
@@ -260,7 +261,7 @@ def _line(at: Float64, value: Float64, weight: Float64) -> tuple[float, float]:
         slope = float(w @ ((at - a) * (value - v))) / spread if spread > 1e-6 else 0.0
         offset = v - slope * a
         residual = np.abs(value - offset - slope * at)
-        weight = weight / (1.0 + (residual / max(2.0 * float(np.median(residual)), 0.01)) ** 2)
+        weight = weight / (1.0 + (residual / max(2.0 * median(residual), 0.01)) ** 2)
     return slope, offset
 
 

@@ -18,7 +18,7 @@ from roadscan.assets.intensity import GAINS_SCHEMA, IntensitySample, gains_of, i
 from roadscan.assets.scene import Scene
 from roadscan.assets.statistics import Measured, Statistics, together
 from roadscan.assets.tasks.load_returns import LoadedSquare, ReturnsTask, load_squares, scene_of
-from roadscan.assets.tasks.plan import AssetPlan, grid_of, readings_of, square_key
+from roadscan.assets.tasks.plan import AssetPlan, cut_squares, grid_of, readings_of, square_key
 from roadscan.assets.tasks.shared import Shared
 from roadscan.assets.tiling import AssetGrid, Halos
 from roadscan.assets.upright.grown import roughness_of_road_m
@@ -30,7 +30,7 @@ from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.store.writer import parquet_bytes
-from roadscan.tiles.blocks import Block, cut_blocks
+from roadscan.tiles.blocks import Block
 from roadscan.tiles.tasks.tile_files import publish_file
 from roadscan.tiles.tasks.tiles import TaskResult
 
@@ -118,7 +118,7 @@ def sample_tasks(
     else:
         readings = readings_of(_grid(plan), plan.tiles.tiles)
         wanted = {square: readings[square] for square, _ in due}
-        blocks = [b.tiles for b in cut_blocks(wanted, _BLOCK_SQUARES, plan.config.max_block_returns)]
+        blocks = cut_squares(wanted, _BLOCK_SQUARES, plan.config.max_block_returns)
     keys, grid = dict(due), _grid(plan)
     return [SampleTask(plan.load(own, grid), tuple(keys[s] for s in own), plan.config.ground) for own in blocks]
 

@@ -72,11 +72,11 @@ class AssetPlan:
         """Returns batches of neighbouring squares, bounded by memory and by squares per worker."""
         readings = {square: self.readings[square] for square in squares}
         edge = _BLOCK_SQUARES
-        blocks = cut_blocks(readings, edge, self.config.max_block_returns)
+        blocks = cut_squares(readings, edge, self.config.max_block_returns)
         while edge > 1 and workers > 1 and len(blocks) < 2 * workers:
             edge //= 2
-            blocks = cut_blocks(readings, edge, self.config.max_block_returns)
-        return [b.tiles for b in blocks]
+            blocks = cut_squares(readings, edge, self.config.max_block_returns)
+        return blocks
 
     def load(self, squares: tuple[TileId, ...], grid: AssetGrid | None = None) -> ReturnsTask:
         """Returns the sources of the returns of some squares, of another grid where one is given."""
@@ -90,6 +90,19 @@ class AssetPlan:
         """Returns squares that see one of some of the survey's tiles, in themselves or in their halo."""
         near = set(chosen)
         return {square for square in self.keys if not near.isdisjoint(self.grid.tiles_under(square))}
+
+
+def cut_squares(readings: Mapping[TileId, int], edge: int, max_readings: int) -> list[tuple[TileId, ...]]:
+    """Returns blocks of at most `edge`² squares and about so many readings: one where all squares fit into one.
+
+    Blocks lie on a lattice through the map's origin, where a survey on a local map begins: cut there, its returns would
+    be read and placed four times.
+    """
+    fits = sum(readings.values()) <= max_readings
+    spans = [max(at) - min(at) + 1 for at in zip(*readings, strict=True)]
+    if readings and fits and max(spans) <= edge:
+        return [tuple(sorted(readings, key=lambda one: (one.row, one.column)))]
+    return [block.tiles for block in cut_blocks(readings, edge, max_readings)]
 
 
 def plan_assets(plan: SurveyPlan, footprints: FootprintRanges) -> AssetPlan:

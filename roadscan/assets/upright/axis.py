@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.kernels.cylinders import LEAST_RADIUS_M, MOST_RADIUS_M, fit_cylinder
+from roadscan.assets.quantiles import median
 
 Float64 = npt.NDArray[np.float64]
 
@@ -62,13 +63,13 @@ def fit_axis(xyh: Float64, sensor_xy: Float64, *, lean: bool = True) -> Axis:
     if np.count_nonzero(seen) < _LEAST_SEEN:
         return _round_axis(xyh, lean)
     xyh, sensor_xy = xyh[seen], sensor_xy[seen]
-    middle = float(np.median(xyh[:, 2]))
+    middle = median(xyh[:, 2])
     sight = sensor_xy - xyh[:, :2]
     sight /= np.maximum(np.hypot(sight[:, 0], sight[:, 1]), 1e-9)[:, None]
     sector = np.floor(np.degrees(np.arctan2(sight[:, 1], sight[:, 0])) / SECTOR_DEG).astype(np.int64)
     order = np.argsort(sector, kind="stable")
     table = np.ascontiguousarray(np.column_stack([xyh[:, :2], xyh[:, 2] - middle, sight])[order])
-    state = np.array([float(np.median(xyh[:, 0])), float(np.median(xyh[:, 1])), 0.0, 0.0, 0.03])
+    state = np.array([median(xyh[:, 0]), median(xyh[:, 1]), 0.0, 0.0, 0.03])
     residual, _ = fit_cylinder(table, sector[order], lean, state, np.empty((len(table), 4)))
     x, y, slope_x, slope_y, radius = map(float, state)
     return Axis(x, y, middle, slope_x, slope_y, radius, float(residual))

@@ -42,7 +42,7 @@ def brightness(scene: Scene) -> npt.NDArray[np.float32]:
     for sensor in np.unique(returns.sensor).tolist():
         own = returns.sensor == sensor
         near = own & ground & (range_m < _NEAR_M)
-        some = near if near.any() else own & ground if (own & ground).any() else own
+        some = next((one for one in (near, own & ground, own & lit) if one.any()), own)
         weight = _SHARE * float(own.sum()) + 1.0
         curve = _medians(range_m[own & upright], light[own & upright], float(np.median(light[some])), weight)
         out[own] = light[own] / np.interp(range_m[own], _MIDDLES_M, curve)

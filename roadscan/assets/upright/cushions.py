@@ -63,8 +63,11 @@ def boxes_of(scene: Scene) -> pa.Table:
 
 def _box(scene: Scene, rows: Int64) -> dict[str, Any] | None:
     returns = scene.returns
+    highest = float(scene.above_ground_m[rows].max())
+    if not _HIGH_M[0] <= highest <= _HIGH_M[1] + 0.3:
+        return None
     top = float(np.quantile(scene.above_ground_m[rows], 0.98))
-    if not _HIGH_M[0] <= top <= _HIGH_M[1] or float(scene.above_ground_m[rows].max()) > _HIGH_M[1] + 0.3:
+    if not _HIGH_M[0] <= top <= _HIGH_M[1]:
         return None
     points = np.column_stack([returns.x_m[rows], returns.y_m[rows]])
     rectangle = shapely.minimum_rotated_rectangle(shapely.MultiPoint(points))

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.assets.quantiles import median
 from roadscan.assets.scene import Box, Scene
 from roadscan.assets.upright.panels import Panel
 from roadscan.assets.upright.pieces import seen_by
@@ -66,13 +67,13 @@ class Chain:
     def median(self, name: str) -> float:
         """Returns the median of a height above the ground, over the stretches that are known; NaN where none is."""
         above = self.values[name] - self.values["ground_m"]
-        return float(np.median(above[np.isfinite(above)])) if np.isfinite(above).any() else math.nan
+        return median(above[np.isfinite(above)]) if np.isfinite(above).any() else math.nan
 
     def sigma_median_m(self, name: str) -> float:
         """Returns 1 σ (m) of that median, from its scatter over the stretches."""
         above = self.values[name] - self.values["ground_m"]
         above = above[np.isfinite(above)]
-        return float(1.2533 * SIGMA_OF_MAD * np.median(np.abs(above - np.median(above))) / math.sqrt(above.size))
+        return float(1.2533 * SIGMA_OF_MAD * median(np.abs(above - median(above))) / math.sqrt(above.size))
 
     @property
     def passing(self) -> float:

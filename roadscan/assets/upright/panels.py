@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -160,19 +159,17 @@ def _with_sight(scene: Scene, panels: list[Panel]) -> list[Panel]:
     low = [p.comes_near(scene.tile) and _is_low(p) for p in panels]
     known = [p for p, asked in zip(panels, low, strict=True) if asked]
 
-    def lines(edges: Callable[[Panel], tuple[Float64, Float64]]) -> Int64:
-        """Returns the sight lines through each stretch between two heights."""
-        rectangles = np.concatenate([np.zeros((0, 6)), *(np.column_stack([p.xy_m[:-1], p.xy_m[1:], *edges(p)])
-                                                         for p in known)])  # fmt: skip
-        found = np.zeros(len(rectangles), np.int64)
-        passing_lines(
-            returns.x_m[some], returns.y_m[some], returns.height_m[some], returns.sensor_x_m[some],
-            returns.sensor_y_m[some], returns.sensor_height_m[some], rectangles, found,
-        )  # fmt: skip
-        return found
-
-    passed = lines(lambda p: (p.low_m + _RIM_M, p.high_m - _RIM_M))
-    under = lines(lambda p: (p.ground_m + _ABOVE_GROUND_M, p.low_m - _RIM_M))
+    lines = np.concatenate([np.zeros((0, 4)), *(np.column_stack([p.xy_m[:-1], p.xy_m[1:]]) for p in known)])
+    bands = np.concatenate([np.zeros((0, 4)), *(
+        np.column_stack([p.low_m + _RIM_M, p.high_m - _RIM_M, p.ground_m + _ABOVE_GROUND_M, p.low_m - _RIM_M])
+        for p in known
+    )])  # fmt: skip
+    found = np.zeros((len(lines), 2), np.int64)
+    passing_lines(
+        returns.x_m[some], returns.y_m[some], returns.height_m[some], returns.sensor_x_m[some],
+        returns.sensor_y_m[some], returns.sensor_height_m[some], lines, bands.reshape(-1, 2, 2), found,
+    )  # fmt: skip
+    passed, under = found.T
     out, first = [], 0
     for p, asked in zip(panels, low, strict=True):
         count = p.returns.size

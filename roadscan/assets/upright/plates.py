@@ -17,6 +17,7 @@ from pydantic import Field
 
 from roadscan.assets.judgement.judge import Judge
 from roadscan.assets.kind import KindOptions
+from roadscan.assets.quantiles import median, quantiles
 from roadscan.assets.scene import Scene
 from roadscan.assets.touching import touching
 from roadscan.assets.upright.brightness import brightness
@@ -192,7 +193,7 @@ def _plane(xyh: Float64) -> tuple[Float64, Float64, float]:
         middle = xyh[kept].mean(axis=0)
         _, _, axes = np.linalg.svd(xyh[kept] - middle, full_matrices=False)
         away = np.abs((xyh - middle) @ axes[2])
-        limit = max(3.0 * SIGMA_OF_MAD * float(np.median(away[kept])), 0.02)
+        limit = max(3.0 * SIGMA_OF_MAD * median(away[kept]), 0.02)
         kept = away <= limit
         if kept.sum() < 5:
             kept[:] = True
@@ -208,7 +209,7 @@ def _sides(scene: Scene, cluster: Int64) -> list[Int64]:
     if min(front.sum(), (~front).sum()) < _LEAST_BRIGHT:
         return [cluster]
     past = (xyh - middle) @ normal
-    apart = float(np.median(past[front]) - np.median(past[~front]))
+    apart = median(past[front]) - median(past[~front])
     return [cluster[front], cluster[~front]] if apart > _BACK_TO_BACK_M else [cluster]
 
 
@@ -294,7 +295,7 @@ def _on_plane(scene: Scene, near: Int64, middle: Float64, normal: Float64, clust
     right, up = _axes(normal)
     u, v, away = past @ right, past @ up, np.abs(past @ normal)
     cu, cv = (cluster - middle) @ right, (cluster - middle) @ up
-    box = [(float(np.quantile(c, 0.01)), float(np.quantile(c, 0.99))) for c in (cu, cv)]
+    box = [quantiles(c, [0.01, 0.99]) for c in (cu, cv)]
 
     def within(margin: float) -> npt.NDArray[np.bool_]:
         (a, b), (c, d) = box

@@ -8,17 +8,18 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.assets import classes
 from roadscan.assets.moving import SLOT_NS
+from roadscan.assets.quantiles import median
 from roadscan.assets.scene import Scene
+from roadscan.assets.upright.kernels.about_shaft import RINGS, Part, about_shaft
 from roadscan.assets.upright.places import places_of
 from roadscan.assets.upright.regions import Region, regions_of
 from roadscan.assets.upright.shafts import Shaft
 from roadscan.assets.upright.slices import SLICE_M
+from roadscan.compute.kernel_options import read_only
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
-Bools = npt.NDArray[np.bool_]
 
 _SKIN_M: Final = 0.1
 """Returns so near to a shaft's surface (m) may lie on it: noise of ranges, bark, and steps of poses."""
@@ -71,45 +72,32 @@ def _about(scene: Scene, shaft: Shaft) -> dict[str, float]:
     """Returns features of what is about a shaft: beside, below and above it."""
     axis, returns = shaft.axis, scene.returns
     near = places_of(scene).within(axis.x_m, axis.y_m, _RINGS_M[-1] + axis.radius_m)
-    height = returns.height_m[near]
-    above = height - shaft.ground_m
-    x, y = axis.at(height)
-    right, ahead = returns.x_m[near] - x, returns.y_m[near] - y
-    away = np.hypot(right, ahead) - axis.radius_m
-    beside = (above >= shaft.low_above_m) & (above <= shaft.top_above_m)
-    on_it, others = beside & (away <= _SKIN_M), beside & (away > _SKIN_M)
-    many = max(int(np.count_nonzero(on_it)), 1)
+    number, sectors = np.zeros(len(Part), np.int64), np.zeros(_SECTORS, np.int64)
+    on_it, slots = np.empty((near.size, 3)), np.zeros(2, np.int64)
+    about_shaft(
+        (returns.x_m, returns.y_m, returns.height_m, scene.classes, read_only(returns.epoch_gps_ns)), near,
+        (axis.x_m, axis.y_m, axis.height_m, axis.slope_x, axis.slope_y, axis.radius_m),
+        (shaft.ground_m, shaft.low_above_m, shaft.top_above_m), (_SKIN_M, *_RINGS_M), SLOT_NS,
+        number, sectors, on_it, slots,
+    )  # fmt: skip
+    on_it, many = on_it[: number[Part.ON_IT]], max(int(number[Part.ON_IT]), 1)
 
-    def odds(some: Bools) -> float:
-        return math.log((int(np.count_nonzero(some)) + 1.0) / many)
+    def odds(part: Part) -> float:
+        return math.log((int(number[part]) + 1.0) / many)
 
-    inner, out = _SKIN_M, {}
-    for edge in _RINGS_M:
-        out[f"in_{round(edge * 100)}_cm"] = odds(beside & (away > inner) & (away <= edge))
-        inner = edge
-    close, higher = away <= _RINGS_M[1], above > shaft.top_above_m
-    middle = 0.5 * (shaft.low_above_m + shaft.top_above_m)
-    for name, part in (("lower", above < middle), ("upper", above >= middle)):
-        out[f"alone_{name}"] = _share(on_it & part, (on_it | (others & close)) & part)
-    out["below"] = odds((above > 0.1) & (above < shaft.low_above_m) & close)
-    out["over"] = odds(higher & close)
-    out["goes_on"] = odds(higher & (away <= _SKIN_M) & (above < shaft.top_above_m + 1.0))
-    sector = np.floor(np.arctan2(ahead, right) / (2 * math.pi / _SECTORS)).astype(np.int64) % _SECTORS
-    taken = np.bincount(sector[others], minlength=_SECTORS) > 0.02 * many
-    out["sides_taken"] = float(np.mean(taken))
-    out["opposite"] = float(np.max(taken & np.roll(taken, _SECTORS // 2)))
-    kind = scene.classes[near]
-    leaves = (kind >= classes.LOW_VEGETATION) & (kind <= classes.HIGH_VEGETATION)
-    for name, one in (("leaves", leaves), ("building", kind == classes.BUILDING)):
-        out[name], out[f"own_{name}"] = _share(beside & one, beside), _share(on_it & one, on_it)
-    slots = np.unique(returns.epoch_gps_ns[near[on_it]] // SLOT_NS)
-    later = np.setdiff1d(returns.epoch_gps_ns[near[higher | others]] // SLOT_NS, slots)
-    out["stays"] = slots.size / max(slots.size + later.size, 1)
-    return out | _build(right[on_it], ahead[on_it], above[on_it])
+    def share(part: Part, of: Part) -> float:
+        return float(number[part]) / max(int(number[of]), 1)
 
-
-def _share(some: Bools, of: Bools) -> float:
-    return float(np.count_nonzero(some)) / max(int(np.count_nonzero(of)), 1)
+    taken = sectors > 0.02 * many
+    return {
+        **{f"in_{round(edge * 100)}_cm": odds(ring) for edge, ring in zip(_RINGS_M, RINGS, strict=True)},
+        "alone_lower": share(Part.ON_LOWER, Part.NEAR_LOWER), "alone_upper": share(Part.ON_UPPER, Part.NEAR_UPPER),
+        "below": odds(Part.BELOW), "over": odds(Part.OVER), "goes_on": odds(Part.GOES_ON),
+        "sides_taken": float(np.mean(taken)), "opposite": float(np.max(taken & np.roll(taken, _SECTORS // 2))),
+        "leaves": share(Part.LEAVES, Part.BESIDE), "own_leaves": share(Part.OWN_LEAVES, Part.ON_IT),
+        "building": share(Part.BUILDING, Part.BESIDE), "own_building": share(Part.OWN_BUILDING, Part.ON_IT),
+        "stays": int(slots[0]) / max(int(slots.sum()), 1),
+    } | _build(*on_it.T)  # fmt: skip
 
 
 def _build(right: Float64, ahead: Float64, above: Float64) -> dict[str, float]:
@@ -120,8 +108,9 @@ def _build(right: Float64, ahead: Float64, above: Float64) -> dict[str, float]:
     level = np.floor(above / SLICE_M).astype(np.int64)
     count = np.bincount(level - level.min())
     some = count >= _LEAST_OF_SLICE
-    small, large = np.linalg.eigvalsh(np.cov(np.stack([right, ahead])))
-    known = {"even": float(np.median(count) / count.max()), "flat": float(small / max(large, 1e-9))}
+    past = np.stack([right - right.mean(), ahead - ahead.mean()])
+    small, large = np.linalg.eigvalsh(past @ past.T * (1.0 / (right.size - 1)))
+    known = {"even": median(count) / float(count.max()), "flat": float(small / max(large, 1e-9))}
     if not some.any():
         return unknown | known
     mean, square = (

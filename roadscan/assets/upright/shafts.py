@@ -11,9 +11,10 @@ import numpy.typing as npt
 
 from roadscan.assets.kernels.slices import slices_above_one_another
 from roadscan.assets.memory import once_a_scene
+from roadscan.assets.quantiles import median
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.axis import Axis, fit_axis
-from roadscan.assets.upright.kernels.shafts import longest_run, near_axis, widths_of_levels
+from roadscan.assets.upright.kernels.shafts import longest_run, near_axis, returns_about, widths_of_levels
 from roadscan.assets.upright.slices import CELL_M, LOWEST_M, SLICE_M, Slices, around, slices_of
 
 Float64 = npt.NDArray[np.float64]
@@ -105,18 +106,9 @@ def _reads(scene: Scene, slices: Slices, members: Int64) -> bool:
 
 def _alone(slices: Slices, members: Int64, returns: int) -> float:
     """Returns the share of the returns about some components, in their slices, that belong to them."""
-    levels = np.unique(slices.level[members])
-    x, y = float(np.median(slices.x_m[members])), float(np.median(slices.y_m[members]))
-    near = around(slices, x, y, ALONE_M)[levels]
-    inside = _disc(*near.shape[1:])
-    return min(returns / max(int(near[:, inside].sum(dtype=np.int64)), 1), 1.0)
-
-
-@functools.cache
-def _disc(rows: int, columns: int) -> npt.NDArray[np.bool_]:
-    """Returns a mask (rows, columns) of the cells within the space about the middle one."""
-    dy, dx = np.indices((rows, columns)) - np.array([rows, columns])[:, None, None] // 2
-    return np.asarray(np.hypot(dx, dy) * CELL_M <= ALONE_M)
+    x, y = median(slices.x_m[members]), median(slices.y_m[members])
+    total = int(returns_about(around(slices, x, y, ALONE_M), slices.level[members], CELL_M, ALONE_M))
+    return min(returns / max(total, 1), 1.0)
 
 
 class _Neighbours:

@@ -11,6 +11,8 @@ import numpy.typing as npt
 import pyarrow as pa
 from scipy.spatial import cKDTree
 
+from roadscan.assets.quantiles import median
+
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
@@ -125,7 +127,7 @@ def _grown(place: Float64, way: Float64, tree: cKDTree, free: npt.NDArray[np.boo
 def _without_neighbours(place: Float64, span: Span) -> Span:
     """Returns a span without the cubes that lie off it, by the median of deviations."""
     for _ in range(_ROUNDS):
-        deviation = np.maximum(1.4826 * np.median(np.abs(span.off_m), axis=0), _LEAST_OFF_M)
+        deviation = np.maximum(1.4826 * np.array([median(off) for off in np.abs(span.off_m).T]), _LEAST_OFF_M)
         inside = (np.abs(span.off_m) <= _OUTLIER * deviation).all(axis=1)
         if inside.all() or np.count_nonzero(inside) < _LEAST_CUBES:
             return span
@@ -158,6 +160,8 @@ def _seen_from(place: Float64, span: Span) -> tuple[Float64, Float64]:
 def _fitted(place: Float64, rows: Int64, way: Float64) -> Span:
     """Returns the span of some cubes by least squares; a short one keeps the direction `way`."""
     own = place[rows]
+    if rows.size == 1:
+        return Span(rows, own[0, :2], way, np.zeros(1), np.zeros((1, 2)), own[:, 2])
     middle = own[:, :2].mean(axis=0)
     past = own[:, :2] - middle
     if np.ptp(past @ way) > 1.0:

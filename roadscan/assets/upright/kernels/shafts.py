@@ -100,3 +100,22 @@ def widths_of_levels(xyh, level, least, shares, widths):
             across = _quantile(x, shares[1]) - _quantile(x, shares[0])
             widths[level[order[first]]] = math.hypot(across, _quantile(y, shares[1]) - _quantile(y, shares[0]))
         first = end
+
+
+@kernel
+def returns_about(counts, level, cell_m, reach_m):
+    """Returns the number of returns in cells within reach of the middle one, in some slices.
+
+    counts : (slices, rows, columns) returns of each cell; level : (n,) int64, slices, each as often as one likes.
+    """
+    _, rows, columns = counts.shape
+    total, seen = 0, 0
+    for k in level:
+        if seen >> k & 1:
+            continue
+        seen |= 1 << k
+        for r in range(rows):
+            for c in range(columns):
+                if math.hypot(c - columns // 2, r - rows // 2) * cell_m <= reach_m:
+                    total += counts[k, r, c]
+    return total

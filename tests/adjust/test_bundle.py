@@ -256,7 +256,8 @@ def test_attitude_and_boresight_are_known_together_far_better_than_each() -> Non
         state = state_of(found)
         _, turned = _body_after(drive, state)
         (joint,) = found.cameras.joint
-        assert (joint.run, joint.sensor) == ("a", "left") and (np.diff(joint.epochs_gps_ns) >= NS_PER_S / 2).all()
+        assert (joint.run, joint.sensor) == ("a", "left")
+        assert (np.diff(joint.epochs_gps_ns)[:-1] >= NS_PER_S / 2).all()  # and the last one at which there is a picture
         sums = joint.covariance[:, 3:6, 3:6] + joint.covariance[:, 9:12, 9:12]
         alone = np.einsum("kii->ki", sums).copy()
         sums += joint.covariance[:, 3:6, 9:12] + joint.covariance[:, 9:12, 3:6]

@@ -30,6 +30,7 @@ from roadscan.pictures.views import Lens
 from tests.adjust.test_bundle import LENS, Block, Drive, simulated_drive
 
 Float64 = npt.NDArray[np.float64]
+Int64 = npt.NDArray[np.int64]
 
 WHERE = "of the extra dev: pip install pycolmap gtsam"
 PICTURES = 12
@@ -110,6 +111,17 @@ class Solved:
         shift = found.translation() - exposures.lever_body_m[0]
         variance = [np.diag(axes @ covariance[own, own] @ axes.T) for own in (slice(3, 6), slice(3))]
         return np.concatenate([shift, turn])[MOUNTED], np.sqrt(np.concatenate(variance))[MOUNTED]
+
+    def joint_covariance(self, pictures: list[int]) -> tuple[Float64, list[Int64]]:
+        """GTSAM's covariance of some poses in roadscan's axes, and the rows of each."""
+        names = [key("x", k) for k in pictures]
+        found, turn = self.marginals.jointMarginalCovariance(names), []
+        for name in names:
+            axes = ENU_FROM_NED.T @ self.values.atPose3(name).rotation().matrix()
+            turn.append(np.block([[np.zeros((3, 3)), axes], [np.eye(3), np.zeros((3, 3))]]))
+        whole = np.block([[a @ found.at(i, j) @ b.T for j, b in zip(names, turn, strict=True)]
+                          for i, a in zip(names, turn, strict=True)])  # fmt: skip
+        return whole, [6 * k + np.arange(6) for k in range(len(names))]
 
     def lens_errors(self) -> tuple[Float64, Float64]:
         """GTSAM's corrections of what `LENS_SIGMA` names, and their σ."""
@@ -214,3 +226,24 @@ def test_points_lie_where_gtsam_has_them() -> None:
                 away.append(np.sqrt(off @ np.linalg.solve(covariance, off) / 3.0))
         assert len(away) > 40
         assert np.median(away) < 0.05 and np.max(away) < 0.3
+
+
+def test_errors_of_two_poses_hang_together_as_gtsam_says() -> None:
+    """What places measured in two pictures rest on: each pose's covariance, and those with the ones after it."""
+    for seed in SEEDS:
+        block = solved(seed)
+        (joint,) = block.ours.cameras.joint
+        epochs = block.pictures.measured.exposures.epoch_gps_ns
+        at = [int(np.flatnonzero(epochs == one)[0]) for one in joint.epochs_gps_ns]
+        assert len(at) > 2 and [len(one) for one in joint.later] == list(range(len(at)))[::-1]
+        for k in range(len(at)):
+            expected, order = block.joint_covariance(at[k:])
+            size = np.sqrt(np.diag(expected))
+            own = expected[np.ix_(order[0], order[0])]
+            np.testing.assert_allclose(joint.covariance[k, :6, :6] / np.outer(*[size[order[0]]] * 2),
+                                       own / np.outer(*[size[order[0]]] * 2), atol=0.02)  # fmt: skip
+            for j, later in enumerate(joint.later[k]):
+                scale = np.outer(size[order[0]], size[order[j + 1]])
+                found = expected[np.ix_(order[0], order[j + 1])]
+                np.testing.assert_allclose(later / scale, found / scale, atol=0.02)
+                assert np.abs(found / scale).max() > 0.5  # there is something to agree on

@@ -41,8 +41,11 @@ _AT_ONCE: Final = 200
 _NEIGHBOURS: Final = 50
 """With more points, at most this many neighbours are judged together."""
 _LENS: Final = len(PARAMETERS)
-_JOINT_NS: Final = 1_000_000_000
-"""Knots at which the errors of pictures are told jointly are so far apart (ns), or farther: these vary slowly."""
+_JOINT_NS: Final = 500_000_000
+"""Knots at which the errors of pictures are told jointly are so far apart (ns), about: in between, σ of places measured
+in two pictures are within 15 % of those that each picture's own covariances give."""
+_LATER: Final = 12
+"""With so many of the next such knots the errors of a pose are told: 6 s, in which a picture's reach is passed."""
 _SCALED: Final = 3
 """The stated σ of single runs are enlarged at most this many times, until none is too small."""
 SURVEY_FACTOR: Final = "control_survey"
@@ -108,9 +111,11 @@ class JointErrors(NamedTuple):
     run: str
     sensor: str
     epochs_gps_ns: Int64
-    """(k,) knots of the run, a second or more apart."""
+    """(k,) knots of the run, about half a second apart."""
     covariance: Float64
     """(k, 21, 21) of the run's pose, `COMPONENTS`, mounting (6) and lens (9); 0 of what is not estimated."""
+    later: tuple[Float64, ...]
+    """(k) of arrays (l, 6, 6): covariances of the pose (rows) with those of the next knots (columns), 12 at most."""
 
 
 @dataclass(frozen=True)
@@ -287,7 +292,7 @@ def _once(
     priors, unknowns, rounds, alone = _without_surveys(first, chosen, settings)
     verdict = judged(*_survey_errors(unknowns, chosen, alone, rounds), settings)
     applied = applied_offset(verdict, settings, settings.reject_beyond)
-    estimate, solution, response = _with_control(unknowns, alone, rounds, verdict, applied)
+    estimate, solution, response, joint = _with_control(unknowns, alone, rounds, verdict, applied)
     values, covariance, with_next = _of_knots(unknowns, estimate, solution)
     told, n = _of_observations(unknowns, ordered, np.flatnonzero(which), estimate), chosen.size
     back = np.empty(order.size, np.int64)
@@ -300,7 +305,7 @@ def _once(
         tuple(p.run for p in priors), unknowns.knots, values, covariance, with_next,
         told[0][back], which[back], told[1][back], told[2][back], told[3][back],
         _of_control(unknowns, estimate, n, verdict.survey_factor), _of_mountings(unknowns, estimate, solution),
-        _of_cameras(unknowns, estimate, solution),
+        _of_cameras(unknowns, estimate, solution, joint),
         {k: float(v) for k, v in factors.items()},
         estimate.rounds, estimate.settled, verdict, applied, tuple(priors), unknowns.active, response,
         factors_of_runs, fixed_runs(unknowns, _of_solution(unknowns, estimate.solution)),
@@ -426,9 +431,9 @@ def _counting(unknowns: Unknowns, verdict: ControlVerdict, refused: Sequence[str
 
 def _with_control(
     unknowns: Unknowns, alone: Estimate, rounds: Rounds, verdict: ControlVerdict, applied: AppliedOffset
-) -> tuple[Estimate, Float64, tuple[Float64, ...]]:
-    """Returns the solution with right surveys, the same with fixed runs held, and derivatives of each knot by an
-    offset of all surveys.
+) -> tuple[Estimate, Float64, tuple[Float64, ...], tuple[JointErrors, ...]]:
+    """Returns the solution with right surveys, the same with fixed runs held, derivatives of each knot by an offset of
+    all surveys, and how the errors of pictures hang together.
 
     Fixed runs are estimated like all others as long as observations are judged: what contradicts their poses within
     the σ of these is not wrong.
@@ -440,13 +445,14 @@ def _with_control(
     if weight.any():
         stated = (applied.offset_m[axis] + lean @ verdict.shift.shift_m) / sigma
         estimate = rounds.with_surveys(weight, stated, verdict.survey_factor, alone.rounds)
+    joint = tuple(_joint(unknowns, estimate, rounds))
     fixed = unknowns.fixed
     solution = rounds.holding(fixed) if fixed.any() else estimate.solution
     if not weight.any():
-        return estimate, solution, tuple(np.zeros((k.size, len(COMPONENTS), 5)) for k in unknowns.knots)
+        return estimate, solution, tuple(np.zeros((k.size, len(COMPONENTS), 5)) for k in unknowns.knots), joint
     moving = [*(axis == a for a in range(3)), *lean.T]
     moved = [_of_solution(unknowns, rounds.response(own / sigma)) for own in moving]
-    return estimate, solution, tuple(np.stack(own, axis=-1) for own in zip(*moved, strict=True))
+    return estimate, solution, tuple(np.stack(own, axis=-1) for own in zip(*moved, strict=True)), joint
 
 
 def _understated_runs(unknowns: Unknowns, rounds: Rounds, verdict: ControlVerdict, estimate: Estimate) -> Float64:
@@ -525,20 +531,19 @@ def _of_mountings(unknowns: Unknowns, estimate: Estimate, solution: Float64) -> 
     return MountingErrors(tuple(one.key for one in unknowns.mountings), prior, error, np.sqrt(variance), covariance)
 
 
-def _of_cameras(unknowns: Unknowns, estimate: Estimate, solution: Float64) -> CameraErrors:
+def _of_cameras(
+    unknowns: Unknowns, estimate: Estimate, solution: Float64, joint: tuple[JointErrors, ...]
+) -> CameraErrors:
     prior, numbers = unknowns.camera_sigma, unknowns.of_cameras
     there = numbers >= 0
     error, variance = np.zeros(prior.shape), np.zeros(prior.shape)
     error[there] = solution[numbers[there]] * prior[there]
     variance[there] = estimate.inverse.at(numbers[there], numbers[there]) * prior[there] ** 2
-    joint = tuple(_joint(unknowns, estimate))
     return CameraErrors(tuple(one.sensor for one in unknowns.cameras), prior, error, np.sqrt(variance), joint)
 
 
-def _joint(unknowns: Unknowns, estimate: Estimate) -> Iterator[JointErrors]:
-    """Yield covariances of poses, mountings and lenses at knots of which the factor of the equations tells them."""
-    from scipy.linalg import block_diag
-
+def _joint(unknowns: Unknowns, estimate: Estimate, rounds: Rounds) -> Iterator[JointErrors]:
+    """Yield covariances of poses, mountings and lenses at knots of poses at which a picture was measured."""
     keys = [one.key for one in unknowns.mountings]
     for camera, prior in enumerate(unknowns.cameras):
         for run, name in enumerate(one.run for one in unknowns.priors):
@@ -547,19 +552,42 @@ def _joint(unknowns: Unknowns, estimate: Estimate) -> Iterator[JointErrors]:
                 continue
             own = np.concatenate([unknowns.of_mountings[seat, :6], unknowns.of_cameras[camera, :_LENS]])
             own_sigma = np.concatenate([unknowns.mount_sigma[seat, :6], unknowns.camera_sigma[camera, :_LENS]])
-            posed = unknowns.of_run(run)
+            posed, knots = unknowns.of_run(run), unknowns.knots[run]
+            # The factor of the equations has covariances of a pose and a mounting that share a measurement.
             told = np.isfinite(_entries(estimate, posed[:, :, None], own[None, None, :6])).all(axis=(1, 2))
-            at, knots = np.flatnonzero(told), unknowns.knots[run]
+            at = np.flatnonzero(told)
             if not at.size:
                 continue
-            at = at[np.unique((knots[at] - knots[at[0]]) // _JOINT_NS, return_index=True)[1]]
-            numbers = np.hstack([posed[at], np.tile(own, (at.size, 1))])
-            sigma = np.hstack([unknowns.sigmas[run][at], np.tile(own_sigma, (at.size, 1))])
-            blocks = np.nan_to_num(_entries(estimate, numbers[:, :, None], numbers[:, None, :]))
-            blocks *= np.asarray(sigma[:, :, None] * sigma[:, None, :], np.float64)
-            parts = posed.shape[1] // len(COMPONENTS)
-            fold = block_diag(np.tile(np.eye(len(COMPONENTS)), parts), np.eye(own.size))
-            yield JointErrors(name, prior.sensor, knots[at], fold @ blocks @ fold.T)
+            first = np.unique((knots[at] - knots[at[0]]) // _JOINT_NS, return_index=True)[1]
+            at = at[np.union1d(first, [at.size - 1])]
+            covariance, later = [], []
+            for start in range(0, at.size, _LATER):
+                near = at[start : start + 2 * _LATER]
+                numbers, sigma = posed[near].ravel(), unknowns.sigmas[run][near].ravel()
+                whole = _whole(rounds, np.concatenate([numbers, own]), np.concatenate([sigma, own_sigma]))
+                blocks = _folded(whole, near.size, own.size)
+                for k in range(min(_LATER, near.size)):
+                    rows = np.r_[6 * k : 6 * k + 6, 6 * near.size : len(blocks)]
+                    covariance.append(blocks[np.ix_(rows, rows)])
+                    after = blocks[6 * k : 6 * k + 6, 6 * (k + 1) : 6 * min(k + 1 + _LATER, near.size)]
+                    later.append(after.reshape(6, -1, 6).transpose(1, 0, 2))
+            yield JointErrors(name, prior.sensor, knots[at], np.array(covariance), tuple(later))
+
+
+def _whole(rounds: Rounds, numbers: Int64, sigma: Float64) -> Float64:
+    """Returns the covariance (n, n) of unknowns (n,) with their scales; 0 where one is none."""
+    there, found = np.flatnonzero(numbers >= 0), np.zeros((numbers.size, numbers.size))
+    found[np.ix_(there, there)] = rounds.covariances([numbers[there]])[0]
+    return found * np.outer(sigma, sigma)
+
+
+def _folded(whole: Float64, knots: int, own: int) -> Float64:
+    """Returns covariances whose poses have the 6 components alone: the parts of their errors are added up."""
+    parts = (len(whole) - own) // (knots * len(COMPONENTS))
+    fold = np.kron(np.eye(knots), np.tile(np.eye(len(COMPONENTS)), parts))
+    poses = fold @ whole[:-own, :-own] @ fold.T
+    beside = fold @ whole[:-own, -own:]
+    return np.block([[poses, beside], [beside.T, whole[-own:, -own:]]])
 
 
 def _entries(estimate: Estimate, first: Int64, second: Int64) -> Float64:

@@ -300,17 +300,19 @@ def _met(
     parting = 2.0 * across[1] @ inverse @ across[0]  # the vector from ray to ray is twice the residual of one
     miss = [parting, -parting]
     for k, ray, spread, bend, share, off, t in zip(numbers, rays, spreads, bends, shares, miss, along, strict=True):
-        moves = _moves(poses, k, ray, t, bend) @ poses.root[k]
+        moves = _moves(poses, k, ray, t, bend)
         joint.append((share @ moves, off @ moves))
         across_ray = poses.map_from_ned[k] @ poses.ned_from_camera[k]
         noise = t**2 * across_ray @ spread @ across_ray.T
         covariance += share @ noise @ share.T
         apart += off @ noise @ off.T
-    alike = np.diag(poses.correlation(*numbers))
+    shared = poses.shared(numbers[0], numbers[1])
     for which, summed in ((0, covariance), (1, apart)):
-        one, other = (part[which] for part in joint)
-        summed += one @ one.T + other @ other.T  # noqa: PLW2901 — in place
-        summed += one @ alike @ other.T + other @ alike @ one.T  # noqa: PLW2901 — in place
+        (one, own), (other, its) = (
+            (part[which], part[which] @ poses.root[k]) for part, k in zip(joint, numbers, strict=True)
+        )
+        both = one @ shared @ other.T
+        summed += own @ own.T + its @ its.T + both + both.T  # noqa: PLW2901 — in place
     feet = [eye + t * unit for eye, unit, t in zip(eyes, units, along, strict=True)]
     gap = float(np.linalg.norm(feet[0] - feet[1]))
     words = []

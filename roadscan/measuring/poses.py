@@ -21,7 +21,7 @@ from roadscan.georeference.sources import MOUNTING_COLUMNS, MOUNTING_SIGMAS, key
 from roadscan.measuring.orientation import nearest_rotation
 from roadscan.navigation.tasks.pose_sigma import pose_sigma, stated_pose_sigma
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_corrections, load_trajectory
-from roadscan.pictures.camera_changes import JOINT, load_joint_covariances
+from roadscan.pictures.camera_changes import JOINT, JointCovariances, load_joint_covariances
 from roadscan.pictures.camera_changes import TABLE as CAMERA_CHANGES
 from roadscan.pictures.lens import PARAMETERS
 from roadscan.pictures.placed import Pictures
@@ -69,7 +69,9 @@ class PicturePoses:
     told: tuple[str, ...]
     """(n,) which σ are assumed because nothing states them; "" where all are stated."""
     correlation_s: float
-    """Time after which errors of poses are correlated by 1/e (s)."""
+    """Time after which errors of poses are correlated by 1/e (s), where no adjustment told how they are."""
+    joint: Mapping[tuple[str, str], JointCovariances]
+    """What an adjustment found, by run and camera."""
 
     def __len__(self) -> int:
         """Return the number of pictures."""
@@ -92,19 +94,27 @@ class PicturePoses:
         lens = f"lens without σ of {', '.join(missing)}, taken as 0" if missing else ""
         return "; ".join(filter(None, (self.told[number], lens)))
 
-    def correlation(self, first: int, second: int) -> Float64:
-        """Return the correlation (21,) of the errors of two pictures, in the order of the columns of `root`.
+    def shared(self, first: int, second: int) -> Float64:
+        """Return the covariance (21, 21) of the errors of one picture (rows) with those of another.
 
-        Errors of poses fade over time within a run and are independent between runs; a mounting is one error, and so
-        is a lens.
+        Errors of poses of a run hang together as an adjustment told, else they fade over time; those of different runs
+        are independent. A mounting is one error, and so is a lens.
         """
         pictures = self.pictures
         one, other = (pictures.logs[pictures.log[k]] for k in (first, second))
-        apart_s = abs(int(pictures.epochs_gps_ns[first]) - int(pictures.epochs_gps_ns[second])) / NS_PER_S
-        out = np.zeros(_MOUNTED + len(PARAMETERS))
-        out[:6] = np.exp(-apart_s / self.correlation_s) if one.run == other.run else 0.0
-        out[6:] = 1.0 if one.sensor == other.sensor else 0.0
-        return out
+        epochs = [int(pictures.epochs_gps_ns[k]) for k in (first, second)]
+        fading = np.exp(-abs(epochs[0] - epochs[1]) / NS_PER_S / self.correlation_s) if one.run == other.run else 0.0
+        alike = np.full(JOINT, fading)
+        alike[6:] = 1.0 if one.sensor == other.sensor else 0.0
+        found = np.asarray(self.root[first] * alike @ self.root[second].T)
+        joint = self.joint.get((one.run, one.sensor)) if one.run == other.run else None
+        told = None if joint is None else joint.between(epochs[0], epochs[1], self.correlation_s)
+        if joint is not None and told is not None:
+            own = np.einsum("kii->ki", joint.at(np.array(epochs)))[:, :6]
+            roots = self.root[[first, second], :6]
+            more = np.sqrt(np.maximum((roots**2).sum(axis=2) - own, 0.0))
+            found[:6, :6] = told + np.diag(fading * more[0] * more[1])
+        return found
 
 
 def picture_poses(plan: SurveyPlan, pictures: Pictures) -> PicturePoses:
@@ -124,18 +134,19 @@ def picture_poses(plan: SurveyPlan, pictures: Pictures) -> PicturePoses:
             geographic[own] = geodetic_from_world(world, eye)
     influence, sigma = np.zeros((count, 6, _MOUNTED)), np.zeros((count, _MOUNTED))
     lens_sigma, root = np.zeros((count, len(PARAMETERS))), np.zeros((count, JOINT, JOINT))
-    told = np.full(count, "", object)
+    told, joint = np.full(count, "", object), dict[tuple[str, str], JointCovariances]()
     for number in np.unique(pictures.log).tolist():
         own = np.flatnonzero(pictures.log == number)
         influence[own], sigma[own], told[own] = _errors(plan, pictures, number, own, level[own])
         log, epochs = pictures.logs[number], pictures.epochs_gps_ns[own]
         lens_sigma[own] = _lens_sigma(plan, log.sensor)
-        joint = load_joint_covariances(plan.store, log.run, log.sensor)
-        root[own] = _root(np.hstack([sigma[own], np.nan_to_num(lens_sigma[own])]), joint, epochs)
+        known = load_joint_covariances(plan.store, log.run, log.sensor)
+        root[own] = _root(np.hstack([sigma[own], np.nan_to_num(lens_sigma[own])]), known, epochs)
+        joint |= {} if known is None else {(log.run, log.sensor): known}
     settings = plan.survey.config.navigation.calibration
     return PicturePoses(
         pictures, place, geographic, from_map, slope, level, influence, sigma, lens_sigma, root, tuple(told.tolist()),
-        settings.traverse_time_constant_s,
+        settings.traverse_time_constant_s, joint,
     )  # fmt: skip
 
 
@@ -216,19 +227,15 @@ def _lens_sigma(plan: SurveyPlan, sensor: str) -> Float64:
     return _adjusted(held.get(sensor), PARAMETERS, np.array(stated))
 
 
-def _root(sigma: Float64, joint: tuple[Int64, Float64] | None, epochs: Int64) -> Float64:
+def _root(sigma: Float64, joint: JointCovariances | None, epochs: Int64) -> Float64:
     """Return a root (k, 21, 21) of the covariance of errors with σ (k, 21), see `PicturePoses.root`.
 
-    joint : epochs and covariances of an adjustment. What the pose's σ have beyond it, and what it did not estimate,
+    joint : of an adjustment. What the pose's σ have beyond it, and what it did not estimate,
     is independent.
     """
     if joint is None:
         return sigma[:, :, None] * np.eye(JOINT)
-    knots, known = joint
-    at = np.interp(epochs.astype(np.float64), knots.astype(np.float64), np.arange(knots.size, dtype=np.float64))
-    before = np.minimum(at.astype(np.int64), knots.size - 1)
-    after, share = np.minimum(before + 1, knots.size - 1), (at - before)[:, None, None]
-    covariance = (1.0 - share) * known[before] + share * known[after]
+    covariance = joint.at(epochs)
     diagonal = np.arange(JOINT)
     own = covariance[:, diagonal, diagonal]
     known_alone = np.hstack([np.maximum(own[:, :6], sigma[:, :6] ** 2), np.where(own > 0.0, own, sigma**2)[:, 6:]])

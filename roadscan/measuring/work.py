@@ -73,7 +73,7 @@ def picked_poses(poses: PicturePoses, index: npt.NDArray[np.int64]) -> PicturePo
     return PicturePoses(
         some, poses.place_m[index], poses.geographic[index], poses.camera_from_map[index], poses.map_from_ned[index],
         poses.ned_from_camera[index], poses.influence[index], poses.sigma[index], poses.lens_sigma[index],
-        poses.root[index], tuple(poses.told[k] for k in index.tolist()), poses.correlation_s,
+        poses.root[index], tuple(poses.told[k] for k in index.tolist()), poses.correlation_s, {},
     )  # fmt: skip
 
 

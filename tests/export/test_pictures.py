@@ -77,6 +77,20 @@ def colmap_projections(folder: Path) -> dict[str, np.ndarray]:
     return found
 
 
+def colmaps_own_projections(folder: Path) -> dict[str, np.ndarray]:
+    """The same as COLMAP itself reads the files and projects."""
+    colmap = pytest.importorskip("pycolmap", reason="of the extra dev: pip install pycolmap")
+    whole = colmap.Reconstruction(str(folder))
+    points = np.array([whole.points3D[number].xyz for number in sorted(whole.points3D)])
+    found = {}
+    for image in whole.images.values():
+        own = image.cam_from_world() * points
+        found[image.name] = np.full((len(points), 2), np.nan)
+        ahead = own[:, 2] > 0.0
+        found[image.name][ahead] = image.camera.img_from_cam(own[ahead]) - 0.5
+    return found
+
+
 def opensfm_projections(folder: Path) -> dict[str, np.ndarray]:
     """Pixels by OpenSfM's documentation: normalised by the longer side, from the picture's middle."""
     (whole,) = json.loads((folder / "reconstruction.json").read_text())
@@ -98,7 +112,10 @@ def opensfm_projections(folder: Path) -> dict[str, np.ndarray]:
     return found
 
 
-@pytest.mark.parametrize(("kind", "read"), [("colmap", colmap_projections), ("opensfm", opensfm_projections)])
+@pytest.mark.parametrize(
+    ("kind", "read"),
+    [("colmap", colmap_projections), ("colmap", colmaps_own_projections), ("opensfm", opensfm_projections)],
+)
 def test_control_points_are_seen_where_they_truly_are(
     measured_drive: Drive,
     tmp_path: Path,

@@ -96,10 +96,17 @@ def disturbed(drive: Drive, rng: np.random.Generator, adjusted: bool) -> Session
     store = drive.store()
     if adjusted:
         write_adjusted(store, np.concatenate([shift, turn]), bend)
-        upper = (alike * np.outer(ALL_SIGMA, ALL_SIGMA))[np.triu_indices(21)].tolist()
-        known: dict[str, object] = {"run": "run-1", "sensor": "camera", "covariance": upper}
+        whole = alike * np.outer(ALL_SIGMA, ALL_SIGMA)
+        known: dict[str, object] = {
+            "run": "run-1",
+            "sensor": "camera",
+            "covariance": whole[np.triu_indices(21)].tolist(),
+        }
         epochs = sorted(p["epoch_gps_ns"] for p in drive.poses.values())[::3]
-        write_small(store, "camera_covariances", [known | {"epoch_gps_ns": epoch} for epoch in epochs])
+        # One error of the poses for the whole drive: each hangs together with the next ones as with itself.
+        later = [whole[:6, :6].ravel().tolist() * (len(epochs) - 1 - k) for k in range(len(epochs))]
+        rows = [known | {"epoch_gps_ns": e, "later": one} for e, one in zip(epochs, later, strict=True)]
+        write_small(store, "camera_covariances", rows)
     else:
         changes |= {
             own + "body_from_sensor": tuple(map(tuple, (u @ w).tolist())),
@@ -108,15 +115,15 @@ def disturbed(drive: Drive, rng: np.random.Generator, adjusted: bool) -> Session
             own + "interior__principal_px": tuple(lens[2:4].tolist()),
             own + "interior__distortion": tuple(lens[4:].tolist()),
         }
-    rows = []
+    held = []
     for epoch in (min(p["epoch_gps_ns"] for p in drive.poses.values()) - 10**9,
                   max(p["epoch_gps_ns"] for p in drive.poses.values()) + 10**9):  # fmt: skip
         row: dict[str, object] = {"run": "run-1", "epoch_gps_ns": epoch}
         names = ("north_m", "east_m", "down_m", "roll_rad", "pitch_rad", "heading_rad")
         row |= dict(zip(names, values.tolist(), strict=True))
         row |= {f"sigma_{n}": s for n, s in zip(names, POSE_SIGMA.tolist(), strict=True)}
-        rows.append(row)
-    write_small(store, "corrections", rows)
+        held.append(row)
+    write_small(store, "corrections", held)
     return Session(changed(survey, changes), store)
 
 

@@ -85,9 +85,15 @@ def publish_cameras(store: Store, found: CameraErrors | None) -> None:
 
 def _publish_joint(store: Store, found: CameraErrors | None) -> None:
     rows = [
-        {"run": one.run, "sensor": one.sensor, "epoch_gps_ns": int(epoch), "covariance": values[_UPPER].tolist()}
+        {
+            "run": one.run,
+            "sensor": one.sensor,
+            "epoch_gps_ns": int(epoch),
+            "covariance": values[_UPPER].tolist(),
+            "later": later.ravel().tolist(),
+        }
         for one in (() if found is None else found.joint)
-        for epoch, values in zip(one.epochs_gps_ns.tolist(), one.covariance, strict=True)
+        for epoch, values, later in zip(one.epochs_gps_ns.tolist(), one.covariance, one.later, strict=True)
     ]
     if rows:
         write_small(store, JOINT_TABLE, rows)

@@ -29,7 +29,9 @@ JOINT: Final = 21
 
 
 _POSE: Final = slice(0, 6)
+"""Errors of the pose among those of a picture: each epoch has its own."""
 _REST: Final = slice(6, JOINT)
+"""Errors of mounting and lens among them: all pictures of a camera share these."""
 
 
 @dataclass(frozen=True, eq=False)

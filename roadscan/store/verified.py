@@ -25,7 +25,7 @@ from roadscan.store.history import history_faults
 from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import Manifest
 from roadscan.store.repair_records import fault_of
-from roadscan.store.small_tables import REPAIR_HINT, read_small, small_path, small_records
+from roadscan.store.small_tables import REPAIR_HINT, digests_fault, read_small, small_path, small_records
 from roadscan.store.stamp import Stamp, stamp_of
 from roadscan.store.store import MADE_AGAIN, Store
 
@@ -112,14 +112,13 @@ def note_written(store: Store, since_ns: int, recorded: pa.Table) -> None:
 
 
 def held_faults(store: Store) -> list[str]:
-    """Return the faults of the small tables."""
-    records = small_records(store)
-    found: list[str | None] = []
+    """Return the faults of the small tables, and of the list of their digests."""
+    records, found = small_records(store), [digests_fault(store) or None]
     for path in map(small_path, REPAIR_HINT):
+        fault = None
         if path in records and store.exists(path):
-            found.append(_held_against(store, {path: Recorded(*records[path])})[path])
-        if not found or found[-1] is None:
-            found.append(_fault_of_held(store, path))
+            fault = _held_against(store, {path: Recorded(*records[path])})[path]
+        found.append(fault or _fault_of_held(store, path))
     return [fault for fault in found if fault is not None]
 
 

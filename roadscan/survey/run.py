@@ -22,6 +22,7 @@ from roadscan.store.holding.look import look_again
 from roadscan.store.logs import read_log_records
 from roadscan.store.manifest import begin_changes, end_changes, write_failures
 from roadscan.store.repair_records import repair_records
+from roadscan.store.small_tables import digests_fault
 from roadscan.store.verified import note_written, recorded_files
 from roadscan.store.written_by import VERSION_FILE, version_content
 from roadscan.surface.tasks.surface_colours import check_cameras
@@ -57,6 +58,8 @@ def run_stage(session: Session, stage: Stage) -> None:
     look_again()
     if session.goes_on is None:
         repair_records(session.store, session.note)
+        if fault := digests_fault(session.store):
+            session.note(fault)
         _tell_upgrade(session)
         session.goes_on = begin_changes(session.store)
         session.began_ns = time.time_ns() - _CLOCK_TICK_NS

@@ -313,3 +313,13 @@ def test_a_small_table_that_was_put_there_is_believed(tmp_path: Path) -> None:
     store.write_bytes(small_path("corrections"), other.read_bytes(small_path("corrections")))
     assert query(store, "SELECT count(*) AS n FROM corrections").to_pylist() == [{"n": 1}]
     assert verify_store(store) == []
+
+
+def test_a_damaged_list_of_digests_is_named_by_verify_and_by_a_run(whole: Simulated, tmp_path: Path) -> None:
+    copy = whole.copy_with_store_to(tmp_path / "survey")
+    held = Path(copy.store().path("manifest/held.json"))
+    content = held.read_bytes()
+    held.write_bytes(content[:-2] + b"\x0b}")
+    assert ["manifest/held.json" in fault for fault in verify_store(copy.store())] == [True]
+    code, words = say("run", copy.survey_file, "--workers", "0")
+    assert code == 0 and "manifest/held.json: it is damaged, so that damage of corrections is not told by it" in words

@@ -29,6 +29,8 @@ SURVEY: Final = len(KINDS)
 _HUBER_ROUNDS: Final = 10  # Rounds with Huber's weights before IGG III.
 _SETTLED: Final = 0.01
 """Weights, and logarithms of factors, that change by less are final."""
+_CALM: Final = 15
+"""Rounds in which weights move all the way; from then on, one that turns takes smaller steps."""
 _ROUGH: Final = 0.1
 """Changes that are small enough for a decision on which σ hold; the result itself is settled."""
 _LEAST: Final = 1e-6
@@ -183,7 +185,7 @@ class Rounds:
         self._pace = Pace(self._weight.size)
         self._factor_pace = Pace(self._kinds.size + self._processes.size)
         for number in range(self.settings.max_rounds):
-            estimate, moved = self._judged(done + number + 1)
+            estimate, moved = self._judged(done + number + 1, calm=number >= _CALM)
             if moved < until:
                 break
         return estimate
@@ -225,7 +227,7 @@ class Rounds:
         solution = self._equations.solve(right)
         return solution, self._observed - rows.times(solution)
 
-    def _judged(self, rounds: int) -> tuple[Estimate, float]:
+    def _judged(self, rounds: int, *, calm: bool) -> tuple[Estimate, float]:
         """Run one round of IGG III; returns its result, which is settled when it equals its input, and the change."""
         solution, residual = self._solved()
         inverse = self._equations.inverse()
@@ -234,7 +236,7 @@ class Rounds:
         without = left_out(residual, inverse.variances(), own, self._counted())
         near, far = self.settings.full_weight_within, self.settings.reject_beyond
         wanted = self.problem.groups.igg_iii(without.statistic, near, far)
-        moved = self._moved_to(weight + self._pace.step(wanted - weight))
+        moved = self._moved_to(weight + self._pace.step(wanted - weight) if calm else wanted)
         if self._estimating:
             way = np.log(self._new_factors(solution, inverse, residual, without, own, weight) / self._factors())
             moved = max(moved, float(np.abs(way).max()))

@@ -90,7 +90,13 @@ class Estimate:
     process_factors: Float64
     """(6,) of the stated variances of the processes."""
     rounds: int
-    settled: bool
+    moved: float
+    """Largest change of a weight, or of the logarithm of a factor, that its result asks for."""
+
+    @property
+    def settled(self) -> bool:
+        """Whether the result equals its input."""
+        return self.moved < _SETTLED
 
 
 class Rounds:
@@ -182,11 +188,10 @@ class Rounds:
 
     def _rounds(self, done: int, until: float = _SETTLED) -> Estimate:
         """Run rounds of IGG III after those that are done, until weights and factors change by less."""
-        self._pace = Pace(self._weight.size)
-        self._factor_pace = Pace(self._kinds.size + self._processes.size)
+        pace, factor_pace = Pace(self._weight.size), Pace(self._kinds.size + self._processes.size)
         for number in range(self.settings.max_rounds):
-            estimate, moved = self._judged(done + number + 1, calm=number >= _CALM)
-            if moved < until:
+            estimate = self._judged(done + number + 1, pace if number >= _CALM else None, factor_pace)
+            if estimate.moved < until:
                 break
         return estimate
 
@@ -227,8 +232,8 @@ class Rounds:
         solution = self._equations.solve(right)
         return solution, self._observed - rows.times(solution)
 
-    def _judged(self, rounds: int, *, calm: bool) -> tuple[Estimate, float]:
-        """Run one round of IGG III; returns its result, which is settled when it equals its input, and the change."""
+    def _judged(self, rounds: int, pace: Pace | None, factor_pace: Pace) -> Estimate:
+        """Run one round of IGG III; weights move all the way without a pace."""
         solution, residual = self._solved()
         inverse = self._equations.inverse()
         own, weight = self._own(), self._weight.copy()
@@ -236,13 +241,12 @@ class Rounds:
         without = left_out(residual, inverse.variances(), own, self._counted())
         near, far = self.settings.full_weight_within, self.settings.reject_beyond
         wanted = self.problem.groups.igg_iii(without.statistic, near, far)
-        moved = self._moved_to(weight + self._pace.step(wanted - weight) if calm else wanted)
+        moved = self._moved_to(wanted if pace is None else weight + pace.step(wanted - weight))
         if self._estimating:
             way = np.log(self._new_factors(solution, inverse, residual, without, own, weight) / self._factors())
             moved = max(moved, float(np.abs(way).max()))
-            self._set_factors(self._factors() * np.exp(self._factor_pace.step(way)))
-        settled = moved < _SETTLED
-        return Estimate(solution, inverse, residual, weight, without, kinds, processes, rounds, settled), moved
+            self._set_factors(self._factors() * np.exp(factor_pace.step(way)))
+        return Estimate(solution, inverse, residual, weight, without, kinds, processes, rounds, moved)
 
     def _moved_to(self, weight: Float64) -> float:
         """Returns weights of the next round; one close to 0 becomes 0, so that 0 marks a row that does not count."""

@@ -136,10 +136,12 @@ def found_assets(session: Session) -> Found | None:
     records = {record.path: record for record in session.manifest.all()}
     for kind in asset_kind_names():
         file = f"{FOUND}/{asset_schema(kind).table}.parquet"
-        if file in records or store.exists(file):  # one that was recorded and is gone is no survey without that kind
-            content = read_recorded(store, records[file]) if file in records else store.read_bytes(file)
-            tables[kind] = store.parse_table(content, file)
-            digests.append(f"{kind}:{bytes_digest(content)}")
+        record = records.get(file)
+        if record is None and not store.exists(file):  # one that was recorded and is gone is named as missing
+            continue
+        content = store.read_bytes(file) if record is None else read_recorded(store, record)
+        tables[kind] = store.parse_table(content, file)
+        digests.append(f"{kind}:{bytes_digest(content)}")
     for one in found_distresses(session):
         tables[one.kind] = one.rows
         digests += [f"{one.kind}:{r.unit}:{r.digest}" for r in one.records]

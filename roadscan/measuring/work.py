@@ -63,7 +63,7 @@ def row_tasks(session: Session) -> list[PictureRows]:
 
 
 def picked_poses(poses: PicturePoses, index: npt.NDArray[np.int64]) -> PicturePoses:
-    """Return the poses of some pictures."""
+    """Return the poses of some pictures, each told alone: without what an adjustment found of two of them."""
     pictures = poses.pictures
     some = replace(
         pictures, views=pictures.views.picked(index), place_m=pictures.place_m[index],

@@ -102,11 +102,11 @@ def small_records(store: Store) -> dict[str, tuple[int, str]]:
 
 def digests_fault(store: Store) -> str:
     """Return the fault of the list of digests; empty where it has none."""
-    if not store.exists(_DIGESTS):
-        return ""
     try:
         _listed(store)
-    except (StoreError, ValueError, TypeError):
+    except StoreError as error:
+        return str(error)
+    except (ValueError, TypeError):
         tables = ", ".join(name for name in REPAIR_HINT if store.exists(small_path(name)))
         return (
             f"{_DIGESTS}: it is damaged, so that damage of {tables or 'small tables'} is not told by it; "
@@ -115,16 +115,17 @@ def digests_fault(store: Store) -> str:
     return ""
 
 
-def _listed(store: Store) -> dict[str, Any]:
-    parsed = parse_checked(store.read_bytes(_DIGESTS))
-    return {name: of for name, of in parsed.items() if name in REPAIR_HINT and dict(of)}
-
-
 def _known(store: Store) -> dict[str, Any]:
-    """Return the stored digests; none where their list is damaged, which :func:`digests_fault` tells."""
-    if not store.exists(_DIGESTS):
-        return {}
+    """Return the stored digests; none where their list has a fault, which :func:`digests_fault` tells."""
     try:
         return _listed(store)
     except (StoreError, ValueError, TypeError):
         return {}
+
+
+def _listed(store: Store) -> dict[str, Any]:
+    """Return the stored digests; raises what is wrong with their list."""
+    if not store.exists(_DIGESTS):
+        return {}
+    parsed = parse_checked(store.read_bytes(_DIGESTS))
+    return {name: of for name, of in parsed.items() if name in REPAIR_HINT and dict(of)}

@@ -113,13 +113,13 @@ def note_written(store: Store, since_ns: int, recorded: pa.Table) -> None:
 
 def held_faults(store: Store) -> list[str]:
     """Return the faults of the small tables, and of the list of their digests."""
-    records, found = small_records(store), [digests_fault(store) or None]
+    records, found = small_records(store), [digests_fault(store)]
     for path in map(small_path, REPAIR_HINT):
         fault = None
         if path in records and store.exists(path):
             fault = _held_against(store, {path: Recorded(*records[path])})[path]
-        found.append(fault or _fault_of_held(store, path))
-    return [fault for fault in found if fault is not None]
+        found.append(fault or _fault_of_held(store, path) or "")
+    return [fault for fault in found if fault]
 
 
 def _held_of(paths: Iterable[str]) -> list[str]:

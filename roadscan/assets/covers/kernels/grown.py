@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from roadscan.compute.kernel_options import inlined, inner, kernel
+from roadscan.compute.kernels.sorted_quantile import sorted_quantile
 
 LANES = 8  # Returns of a cell whose neighbours are sought together.
 
@@ -54,7 +55,8 @@ def grow_spot(x, y, value, buckets, grid, place, limits, shares):
                     _add_near(east, north, u[m], v[m], w[m], smooth * smooth, total, number)
             for k in range(n, min(n + LANES, starts[c + 1])):
                 mean[order[k]] = total[k - n] / number[k - n]
-    half = (_quantile(mean[away <= place[2]], shares[0]) + _quantile(mean[away >= place[2] + gap], shares[1])) / 2.0
+    core, beside = np.sort(mean[away <= place[2]]), np.sort(mean[away >= place[2] + gap])
+    half = (sorted_quantile(core, shares[0]) + sorted_quantile(beside, shares[1])) / 2.0
     stack, top = np.empty(size, np.int64), 0
     free = np.empty(size, np.bool_)
     for n in range(size):
@@ -125,14 +127,3 @@ def _in_cells(x, y, near, place, radius, edge):
         order[at[cell[k]]] = k
         at[cell[k]] += 1
     return starts, order, cell
-
-
-@inner
-def _quantile(values, share):
-    """Returns a quantile of values (n,), on a straight line between the two that are next to it, as NumPy does."""
-    ordered = np.sort(values)
-    at = share * (ordered.size - 1)
-    low = int(at)
-    part = at - low
-    least, most = ordered[low], ordered[min(low + 1, ordered.size - 1)]
-    return most - (most - least) * (1.0 - part) if part >= 0.5 else least + (most - least) * part

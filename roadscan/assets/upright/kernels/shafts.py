@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from roadscan.compute.kernel_options import inlined, kernel
+from roadscan.compute.kernels.sorted_quantile import sorted_quantile
 
 REACHES_M = (0.3, 0.2, 0.15)
 """Components this near to the axis (m) belong to it, round after round."""
@@ -73,15 +74,6 @@ def longest_run(level, gap, least, kept):
         kept[i] = kept[i] and best >= least and held[first] <= level[i] <= held[first + best - 1]
 
 
-@inlined
-def _quantile(held, share):
-    """Returns the number below which a share of sorted values (n,) lies, interpolated as NumPy does."""
-    place = (held.size - 1) * share
-    i = int(place)
-    low, high, past = held[i], held[min(i + 1, held.size - 1)], place - i
-    return high - (high - low) * (1.0 - past) if past >= 0.5 else low + (high - low) * past
-
-
 @kernel
 def widths_of_levels(xyh, level, least, shares, widths):
     """Compute the diagonal of the box about the middle returns of each level: widths (levels,); unset of too few.
@@ -97,8 +89,10 @@ def widths_of_levels(xyh, level, least, shares, widths):
             end += 1
         if end - first >= least:
             x, y = np.sort(xyh[order[first:end], 0]), np.sort(xyh[order[first:end], 1])
-            across = _quantile(x, shares[1]) - _quantile(x, shares[0])
-            widths[level[order[first]]] = math.hypot(across, _quantile(y, shares[1]) - _quantile(y, shares[0]))
+            across = sorted_quantile(x, shares[1]) - sorted_quantile(x, shares[0])
+            widths[level[order[first]]] = math.hypot(
+                across, sorted_quantile(y, shares[1]) - sorted_quantile(y, shares[0])
+            )
         first = end
 
 

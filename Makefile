@@ -55,7 +55,7 @@ pytest: $(VENV)/.installed-dev  ## Tests only; PYTEST_ARGS="tests/core -n0" narr
 	$(BIN)/python -m pytest $(or $(PYTEST_ARGS),-q -n 2 --dist worksteal)
 
 nightly: $(VENV)/.installed-dev  ## What takes too long for every change: fuzz, power cuts, servers, a second user, benchmarks, no AVX-512.
-	$(BIN)/python -m pytest -q -n 2 -m nightly $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -q -n 2 -m nightly --timeout=1800 $(PYTEST_ARGS)
 
 test-library: export ROADSCAN_CODECS := library
 test-library: pytest  ## Tests with libraries in place of the own codecs.

@@ -7,6 +7,7 @@ import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Final
 from weakref import WeakValueDictionary
 
@@ -155,6 +156,12 @@ def log_keys(store: Store) -> list[str]:
     return [path.rsplit("/", 1)[1].removesuffix(".json") for path in store.files(_FOLDER, ".json")]
 
 
+def copies_alone(store: Store) -> list[str]:
+    """Return the copies of records that are gone, or were never written: of a command that was killed."""
+    keys = set(log_keys(store))
+    return [path for path in store.files(_COPIES, ".json") if Path(path).stem not in keys]
+
+
 def _start(record: LogRecord) -> int:
     """Return the first epoch (GPS ns) of a log, 0 for one without rows or epochs."""
     return min(((record.span(table) or (0, 0))[0] for table in record.tables), default=0)
@@ -172,8 +179,8 @@ def retire_log(store: Store, record: LogRecord) -> None:
     """
     path = record_path(record.key)
     store.write_bytes(f"superseded/{path}", store.read_bytes(path))
+    store.remove(copy_path(record.key))  # before the record by which it is found
     store.remove(path)  # before its rows, so that no log is partially present
-    store.remove(copy_path(record.key))
     for table in record.tables:
         if store.is_folder and store.exists(record.folder(table)):
             aside = f"superseded/{record.folder(table)}"

@@ -16,7 +16,7 @@ from roadscan.ingest.planned_logs import logs_of
 from roadscan.navigation.tasks.navigate import known_keys
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
-from roadscan.store.logs import NAVIGATION, LogRecord, copy_path, log_of, read_log_records, record_path
+from roadscan.store.logs import NAVIGATION, LogRecord, copies_alone, copy_path, log_of, read_log_records, record_path
 from roadscan.store.store import Store
 from roadscan.tiles.product import products as known_products
 
@@ -88,7 +88,10 @@ def remove_waste(session: Session, waste: Collection[Waste]) -> None:
     gone = {one.path for one in waste}
     for record in read_log_records(store):
         if record_path(record.key) in gone:
-            for path in (record_path(record.key), copy_path(record.key)):  # before its rows
+            for path in (
+                copy_path(record.key),
+                record_path(record.key),
+            ):  # before its rows; a copy is found by its record
                 store.remove(path)
     kinds = {one.kind for one in waste} - KINDS.keys()
     session.manifest.remove([r for kind in kinds for r in session.manifest.of(kind).values() if r.path in gone])
@@ -111,6 +114,7 @@ def _found(session: Session, records: Collection[LogRecord], unused: Collection[
     for path in store.files("tables"):
         if (key := log_of(path)) and path not in needed and key not in keys and not path.startswith(_FOOTPRINTS):
             yield UNRECORDED, path
+    yield from ((UNRECORDED, path) for path in copies_alone(store))
     for folder in {folder for stage in stages() for folder in stage.folders()}:
         yield from ((UNRECORDED, path) for path in store.files(folder) if path not in needed)
 

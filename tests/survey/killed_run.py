@@ -11,6 +11,7 @@ import os
 import signal
 import sys
 import time
+import traceback
 
 import psutil
 
@@ -41,6 +42,10 @@ def _run() -> None:
         main()
     except SystemExit as end:
         status = end.code if isinstance(end.code, int) else int(end.code is not None)
+        if isinstance(end.code, str):
+            sys.stderr.write(f"{end.code}\n")
+    except Exception:  # noqa: BLE001 — it ends in words, whatever it is
+        traceback.print_exc()  # `os._exit` below would end the fork before Python shows it
     finally:
         sys.stderr.flush()
         os._exit(status)

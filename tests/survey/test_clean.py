@@ -13,7 +13,8 @@ from roadscan.core.errors import ConfigError, RunError
 from roadscan.core.survey import Survey
 from roadscan.ingest.ingest import ingest
 from roadscan.run.session import Session
-from roadscan.survey.clean import DAMAGED, SUPERSEDED, UNRECORDED, UNUSED, waste_of
+from roadscan.store.store import Store
+from roadscan.survey.clean import DAMAGED, SUPERSEDED, UNRECORDED, UNUSED, remove_waste, waste_of
 from roadscan.survey.status import verify_store
 from tests.surveys import Simulated, outputs
 
@@ -22,6 +23,8 @@ OWN = "notes/of-the-user.txt"
 STRAY = "tiles/las/1_1.laz"
 ROWS = "tables/scans/run=run-1/sensor=profiler_left/log=0123456789abcdef/gps_bin_s=0/part-00000.parquet"
 """Rows of a log whose ingest was killed on an object store before its record was written."""
+COPY = "manifest/log_copies/fedcba9876543210.json"
+"""Copy of a log's record, which was not written before a kill."""
 HALF = """
 [[runs.logs]]
 path = "raw/run-2/profiler_right.parquet"
@@ -39,7 +42,7 @@ def used(finished: Simulated, tmp_path: Path) -> Simulated:
     late = text.replace(HALF, "").replace('system = "utc_hour"', 'system = "utc_hour", offset_s = 0.25')
     copy.survey_file.write_text(late)
     ingest(Survey.load(copy.survey_file), store)
-    for path in (EDITS, OWN, STRAY, ROWS, "damaged/tiles/las/2_2.laz"):
+    for path in (EDITS, OWN, STRAY, ROWS, COPY, "damaged/tiles/las/2_2.laz"):
         store.write_bytes(path, b"something")
     return copy
 
@@ -55,7 +58,7 @@ def test_what_nothing_needs_goes_and_all_else_stays(used: Simulated) -> None:
     waste = {kind: [one.path for one in waste_of(Session.open(used.survey_file), [kind])] for kind in
              (SUPERSEDED, DAMAGED, UNUSED, UNRECORDED)}  # fmt: skip
     assert waste[DAMAGED] == ["damaged/tiles/las/2_2.laz"]
-    assert set(waste[UNRECORDED]) == {STRAY, ROWS}
+    assert set(waste[UNRECORDED]) == {STRAY, ROWS, COPY}
     assert {path.split("/")[0] for path in waste[SUPERSEDED]} == {"superseded"}
     assert any("sensor=profiler_right" in path and "run=run-2" in path for path in waste[UNUSED])
     assert not any("run-1" in path for path in waste[UNUSED])
@@ -72,6 +75,26 @@ def test_what_nothing_needs_goes_and_all_else_stays(used: Simulated) -> None:
     store.remove(EDITS)
     assert verify_store(store) == []
     assert waste_of(Session.open(used.survey_file)) == []
+
+
+@pytest.mark.parametrize("kept", [0, 1, 2, 3, 7])
+def test_a_clean_that_was_killed_leaves_nothing_that_the_next_one_does_not_find(
+    used: Simulated, monkeypatch: pytest.MonkeyPatch, kept: int
+) -> None:
+    waste, removed, remove = waste_of(Session.open(used.survey_file)), [], Store.remove
+
+    def dying(store: Store, path: str) -> None:
+        if len(removed) == kept:
+            raise KeyboardInterrupt
+        removed.append(path)
+        remove(store, path)
+
+    with monkeypatch.context() as killed, pytest.raises(KeyboardInterrupt):
+        killed.setattr(Store, "remove", dying)
+        remove_waste(Session.open(used.survey_file), waste)
+    assert len(removed) == kept
+    remove_waste(Session.open(used.survey_file), waste_of(Session.open(used.survey_file)))
+    assert not any(used.store().exists(one.path) for one in waste)
 
 
 def test_age_and_products(finished: Simulated, tmp_path: Path) -> None:

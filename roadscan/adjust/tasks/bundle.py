@@ -26,7 +26,8 @@ from roadscan.pictures.exposures import Exposures, exposures_of
 from roadscan.pictures.frames.chosen import camera_pictures
 from roadscan.pictures.points import TABLE, measured_points
 from roadscan.pictures.settings import PictureTiesConfig
-from roadscan.pictures.ties.work import ALL, TRACKS
+from roadscan.pictures.ties.chains import TRACKS
+from roadscan.pictures.ties.work import ALL
 from roadscan.store.manifest import Manifest, recorded_table
 from roadscan.store.store import Store
 

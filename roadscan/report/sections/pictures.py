@@ -8,6 +8,9 @@ from typing import Any, Final
 import pyarrow as pa
 
 from roadscan.adjust.tasks.outcome import FOLDER, PICTURES
+from roadscan.pictures.ties.chains import TRACKS
+from roadscan.pictures.ties.stage import MASKS
+from roadscan.pictures.ties.work import ALL
 from roadscan.report.blocks import Block, Paragraph, Picture, Table
 from roadscan.report.section import Material, Section
 from roadscan.run.session import Session
@@ -31,6 +34,14 @@ class Pictures(Section):
         if rows is None:
             return
         yield _cameras(rows)
+        tied = session.manifest.get(TRACKS, ALL)
+        if tied is not None:
+            figures = tied.figures()
+            yield Table(
+                ("left out at tie points", "number"),
+                [(what, f"{figures[word]:,}") for word, what in MASKS.items() if word in figures],
+                "What masks left out before the adjustment", "picture_masks",
+            )  # fmt: skip
         for record in session.manifest.of(PICTURES).values():
             if record.path.startswith(f"{FOLDER}/camera-") and session.store.exists(record.path):
                 yield Picture(material.picture(record.path), "Residuals of tie points, before and after", 170.0)

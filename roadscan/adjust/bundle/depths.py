@@ -36,6 +36,7 @@ _THICK_M: Final = 0.04
 """RMS distance of the returns from their plane, at most (m): twice that of a good lidar."""
 _FAR_M: Final = 0.1
 """Distance of each return from the plane, at most (m): beyond there is an edge of depth, or a kerb."""
+_NONE: Final = 1e-6  # Weight of a row that does not count: its σ is a thousand times larger.
 _WIDE: Final = 4.0
 """Extent of the returns along the plane's shorter axis over their distance from it, at least."""
 
@@ -165,11 +166,13 @@ class DepthRows:
     """(r,) of each row."""
     value_m: Float64
     """(k,) distance of each tie point from its surface by the state; NaN where it has no place."""
+    alone_sigma_m: Float64
+    """(k,) 1 σ of each, without what it shares with all others of its picture."""
 
 
 def depth_rows(
     measured: Measurements, surfaces: Surfaces, state: State, numbers: Numbers, points: tuple[Float64, Int64],
-    stated: tuple[float, float],
+    stated: tuple[float, float], weight: Float64,
 ) -> DepthRows:  # fmt: skip
     """Returns the observations of surfaces, linear about a state; observed values are as if that were 0.
 
@@ -177,6 +180,7 @@ def depth_rows(
     ----------
     points : places (p, 3) of the points, world frame, and their numbers (p,) as places of the adjustment.
     stated : 1 σ of a distance beside that of its plane, and of what all of a picture are off in common (m).
+    weight : (m,) of each measurement; what has none stays, with a σ by which it says nothing.
     """
     own, (place_m, first_place) = measured.at(surfaces.measurement), points
     where = _at_stamps(own, state, numbers)
@@ -194,8 +198,10 @@ def depth_rows(
     along = np.einsum("ni,ni->n", normal, away)
     seated = np.concatenate([normal, np.cross(away, normal), along[:, None]], axis=1)
     observed = value + (posed * where.correction).sum(axis=1) + (seated * changes).sum(axis=1)
-    number = np.bincount(own.picture, minlength=len(own.exposures))[own.picture]
-    sigma = np.sqrt(surfaces.sigma_m**2 + stated[0] ** 2 + number * stated[1] ** 2)
+    counts = weight[surfaces.measurement]
+    number = np.bincount(own.picture, counts, minlength=len(own.exposures))[own.picture]
+    alone = np.hypot(surfaces.sigma_m, stated[0])
+    sigma = np.sqrt((alone**2 + number * stated[1] ** 2) / np.maximum(counts, _NONE))
     rows = np.flatnonzero(np.isfinite(observed))
     r = rows.size
     ends, seats = np.zeros((r, 2, len(COMPONENTS))), np.zeros((r, 2, len(MOUNTED)))
@@ -208,7 +214,7 @@ def depth_rows(
         np.arange(r), first_place[own.point[rows]], np.full(r, FREE_M),
         np.stack([surfaces.sensor[rows], beside], axis=-1), seats,
     )  # fmt: skip
-    return DepthRows(observations, rows, value)
+    return DepthRows(observations, rows, value, alone)
 
 
 def _at_stamps(measured: Measurements, state: State, numbers: Numbers) -> Seen:

@@ -127,16 +127,18 @@ def _depths(approach: Approached, adjusted: Adjustment, state: State) -> DepthOu
     surfaces, depths, pictures = approach.surfaces, approach.depths, approach.pictures
     if surfaces is None or depths is None or not depths.surface.size:
         return None
-    values = []
+    values, stated = [], (pictures.depth_sigma_m, approach.depth_weight)
     for one in (State(), state):
         where = seen(pictures.measured, one, pictures.numbers)
         place = met_at(pictures.measured, where, np.where(pictures.enters, approach.weight, 0.0))
         first = np.arange(len(place))
-        rows = depth_rows(pictures.measured, surfaces, one, pictures.numbers, (place, first), pictures.depth_sigma_m)
+        rows = depth_rows(pictures.measured, surfaces, one, pictures.numbers, (place, first), *stated)
         values.append(rows.value_m[depths.surface])
     last = adjusted.weight.size - approach.rows.measurement.size
     weight = adjusted.weight[last - depths.surface.size : last]
-    return DepthOutcome(surfaces.at(depths.surface), *values, depths.observations.sigma_m, weight)
+    weight = weight * approach.depth_weight[surfaces.measurement[depths.surface]]
+    before, after = values
+    return DepthOutcome(surfaces.at(depths.surface), before, after, depths.observations.sigma_m, weight)
 
 
 def _residuals(pictures: PictureEvidence, state: State, weight: Float64) -> Float64:

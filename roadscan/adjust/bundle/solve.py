@@ -97,6 +97,8 @@ class Approached:
     """Surfaces of lidars at tie points; None where there are none."""
     depths: DepthRows | None
     """Their rows: those of tie points that they do not contradict as things that move."""
+    depth_weight: Float64
+    """(m,) weight of the depth at each measurement."""
     moving: Int64
     """Numbers of the tie points that lidars saw elsewhere, as things that move, and which do not count."""
 
@@ -140,7 +142,7 @@ def approached(
     before, settled = np.zeros((0, 2)), False
     surfaces: Surfaces | None = None
     depths: DepthRows | None = None
-    moving = np.zeros(0, np.int64)
+    moving, depth_weight = np.zeros(0, np.int64), np.ones(pictures.measured.point.size)
     for number in range(1, _MOST + 1):
         measured = pictures.measured
         where = seen(measured, state, pictures.numbers)
@@ -148,7 +150,7 @@ def approached(
         rows = entering(pictures, where, (place_m, first), weight, heavy)
         if number <= _LOOKS:
             surfaces = surfaces_of(measured, pictures.returns, state, pictures.numbers)
-        depths = _depths(pictures, surfaces, state, (place_m, first))
+        depths = _depths(pictures, surfaces, state, (place_m, first), depth_weight)
         if len(before):
             settled = number > _WIDE.size and _change(before, rows.residual_px, weight) < _SETTLED_PX
         if settled or number == _MOST:
@@ -160,9 +162,12 @@ def approached(
         state = state_of(found)
         wide = float(_WIDE[min(number, _WIDE.size) - 1])
         lengths, root = _judged(pictures, rows, found, others[0].size + more.size)
-        if surfaces is not None and depths is not None:
-            moving = _moving(pictures, surfaces, depths, found, others[0].size)
         limits = settings.full_weight_within * wide, settings.reject_beyond * wide
+        if surfaces is not None and depths is not None:
+            off = _off_surfaces(depths, found, others[0].size)
+            depth_weight = np.ones(depth_weight.size)
+            depth_weight[surfaces.measurement[depths.surface]] = igg_iii(off[1], *limits)
+            moving = _moving(pictures.measured.point[surfaces.measurement[depths.surface]], off)
         weight, factor = _weights(pictures, state, (lengths, weight), limits)
         heavy = max(heavy * root / factor, 1.0) if number > _WIDE.size else 1.0
         pictures = _with_sigma(pictures, factor)
@@ -172,30 +177,42 @@ def approached(
         weight = np.where(np.isin(pictures.measured.point, moving), 0.0, weight)
         rows = entering(pictures, where, (place_m, first), weight, heavy)
         place_m = np.where(np.isin(np.arange(len(place_m)), moving)[:, None], np.nan, place_m)
-        depths = _depths(pictures, surfaces, state, (place_m, first))
+        depths = _depths(pictures, surfaces, state, (place_m, first), depth_weight)
     entered = np.isin(np.arange(weight.size), rows.measurement)
     weight = np.where(entered, weight, 0.0)
     rows = sharing(rows, pictures, weight)
-    return Approached(pictures, rows, weight, sigma, others, surfaces, depths, moving)
+    return Approached(pictures, rows, weight, sigma, others, surfaces, depths, depth_weight, moving)
 
 
 def _depths(
-    pictures: PictureEvidence, surfaces: Surfaces | None, state: State, points: tuple[Float64, Int64]
+    pictures: PictureEvidence, surfaces: Surfaces | None, state: State, points: tuple[Float64, Int64], weight: Float64
 ) -> DepthRows | None:
     """Returns the rows of surfaces about a state; of a tie point that does not count there are none."""
     if surfaces is None:
         return None
-    return depth_rows(pictures.measured, surfaces, state, pictures.numbers, points, pictures.depth_sigma_m)
+    return depth_rows(pictures.measured, surfaces, state, pictures.numbers, points, pictures.depth_sigma_m, weight)
 
 
-def _moving(pictures: PictureEvidence, surfaces: Surfaces, depths: DepthRows, found: Adjustment, others: int) -> Int64:
+def _off_surfaces(depths: DepthRows, found: Adjustment, others: int) -> tuple[Float64, Float64]:
+    """Returns distances (r,) of tie points from their surfaces by the prediction of all other rows (m), and the same in
+    the σ that they have alone, whatever their weight.
+    """
+    own = slice(others, others + depths.surface.size)
+    left_out = np.abs(found.residual_m[own] / found.redundancy[own])
+    predicted = (left_out / found.normalised_residual[own]) ** 2 - depths.observations.sigma_m**2
+    return left_out, left_out / np.sqrt(np.maximum(predicted, 0.0) + depths.alone_sigma_m[depths.surface] ** 2)
+
+
+def _moving(point: Int64, off: tuple[Float64, Float64]) -> Int64:
     """Returns numbers of the tie points that most of their surfaces contradict by far: what moves along the epipolar
     lines, as a car ahead does, has its rays meet at a wrong distance.
+
+    Parameters
+    ----------
+    point : (r,) of each row.
+    off : distances (m) and the same in σ.
     """
-    off = np.abs(found.residual_m[others : others + depths.surface.size])
-    off_sigma = np.abs(found.normalised_residual[others : others + depths.surface.size])
-    far = (off > _ELSEWHERE_M) & (off_sigma > _ELSEWHERE)
-    point = pictures.measured.point[surfaces.measurement[depths.surface]]
+    far = (off[0] > _ELSEWHERE_M) & (off[1] > _ELSEWHERE)
     size = int(point.max(initial=-1)) + 1
     return np.flatnonzero(2 * np.bincount(point[far], minlength=size) > np.bincount(point, minlength=size))
 

@@ -65,7 +65,7 @@ def pictures_key(plan: SurveyPlan, manifest: Manifest) -> list[Any]:
         return []
     tracks, cameras = manifest.get(TRACKS, ALL), adjusted_cameras(plan.survey)
     clocks, mountings = load_clocks(plan.store), load_mountings(plan.store)
-    logs = []
+    logs = list[list[Any]]()
     for record in plan.records:
         if record.tables.get("images") and record.sensor in cameras:
             posed = [file.digest for file in trajectory_source(record.run, plan.records).files]

@@ -258,13 +258,13 @@ def picture_lines(found: PictureOutcome | None, cameras: CameraErrors | None, fr
     if found.depths is not None:
         holds = found.depths.weight > 0.0
         was, now = (
-            float(np.sqrt(np.nanmean(v[holds] ** 2))) if holds.any() else float("nan")
+            float(np.nanmedian(np.abs(v[holds]))) if holds.any() else float("nan")
             for v in (found.depths.before_m, found.depths.after_m)
         )
         lines.append(
-            f"{int(holds.sum()):,} of {holds.size:,} depths of the lidar at tie points count: RMS {1e3 * was:.0f} mm "
-            f"before, {1e3 * now:.0f} mm after; {found.moving:,} tie points that it saw elsewhere (things that move) "
-            "are left out"
+            f"{int(holds.sum()):,} of {holds.size:,} depths of the lidar at tie points count: half of them "
+            f"within {1e3 * was:.0f} mm before, {1e3 * now:.0f} mm after; "
+            f"{found.moving:,} tie points that it saw elsewhere (things that move) are left out"
         )
     return [*lines, *_camera_lines(cameras, free), *found.notes]
 

@@ -96,8 +96,8 @@ def depth_tasks(
         pixels = tuple(_spread(pixel[order[starts[k] : starts[k + 1]]]) for k in rows.tolist())
         spans = [(int(t) - _MOMENT_NS, int(t) + _MOMENT_NS) for t in own.epoch_gps_ns]
         near_px = _BESIDE_PX + 3.0 * boresight_sigma(camera.sensor) * float(camera.lens.parameters[:2].max())
-        for (run, lidar), files in lidars.items():
-            near = [NearFile.of(source, file, spans) for source, file in files] if run == camera.run else []
+        for (run, lidar), own_files in lidars.items():
+            near = [NearFile.of(source, file, spans) for source, file in own_files] if run == camera.run else []
             there = tuple(one for one in near if one is not None)
             if not there:
                 continue

@@ -35,8 +35,8 @@ class Adjust(Stage):
         "mountings", "footprints", "picture_tracks", "images",
     )  # fmt: skip
     writes = (
-        "ties", "control_sightings", *TABLES, "corrections", "mounting_corrections", "camera_corrections",
-        "camera_covariances",
+        "ties", "control_sightings", "tie_returns", *TABLES, "corrections", "mounting_corrections",
+        "camera_corrections", "camera_covariances",
     )  # fmt: skip
 
     def run(self, session: Session) -> None:
@@ -88,5 +88,5 @@ class Adjust(Stage):
 
     def folders(self) -> Sequence[str]:
         """Returns folders: evidence, tables of the outcome, pictures."""
-        locations = [table_schema(name).location for name in ("ties", "control_sightings", *TABLES)]
+        locations = [table_schema(name).location for name in ("ties", "control_sightings", "tie_returns", *TABLES)]
         return [*(location for location in locations if location is not None), FOLDER]

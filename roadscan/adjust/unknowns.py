@@ -34,7 +34,7 @@ Int64 = npt.NDArray[np.int64]
 _SIZE = len(COMPONENTS)
 _MOUNT_SIZE = len(MOUNTED)
 _TIE_POINT = KINDS.index("picture_tie")
-_IN_PICTURES = (_TIE_POINT, KINDS.index("picture_control"))
+_IN_PICTURES = (_TIE_POINT, KINDS.index("picture_control"), KINDS.index("picture_depth"))
 _DOWN = 2  # Index of the component down.
 _ALONG = 0.5
 """Least component of a direction along an axis for it to determine that coordinate; each has one or two such axes."""

@@ -134,7 +134,7 @@ class Sensor(Strict):
     none."""
     own_vehicle_px: tuple[tuple[tuple[float, float], ...], ...] = ()
     """Polygons in a camera's pictures that show its own vehicle, each a list of corners (u, v), in pixels from the
-    centre of the upper left one: no colour is taken from there."""
+    centre of the upper left one: neither a colour nor a tie point is taken from there."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

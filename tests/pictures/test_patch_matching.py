@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from roadscan.core.rig import Interior
 from roadscan.pictures.kernels.patch_matching import match_patches
 from roadscan.pictures.lens import pixels_of
+from roadscan.pictures.ties.chains import Chains
 from roadscan.pictures.ties.refining import _forms
-from roadscan.pictures.ties.work import Chains, TieWork
+from roadscan.pictures.ties.work import TieWork
 from roadscan.pictures.views import Lens
 
 SIZE = 400

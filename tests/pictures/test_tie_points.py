@@ -57,18 +57,19 @@ def test_matches_hold_though_the_stated_pose_is_off(false: float) -> None:
     off = Rotation.from_rotvec(np.radians([0.2, -0.15, 0.1])).as_matrix()
     turn = off @ Rotation.from_rotvec([0.01, 0.02, -0.005]).as_matrix()
     stated = Relative(turn, np.array([0.09, -0.01, 1.2]), np.radians(0.2), 0.05)
-    found = matches((one, alike), (other, noisy), stated, PIXEL_RAD)
+    found, against = matches((one, alike), (other, noisy), stated, PIXEL_RAD)
     right = found[:, 0] == found[:, 1]
     assert right.sum() > 0.9 * (1.0 - false) * 400
     # What lies on the epipolar line by chance stays: a few in a hundred.
     assert (~right).sum() <= 0.05 * len(found)
+    assert against <= 400 - len(found)
 
 
 def test_two_pictures_of_other_streets_have_no_match() -> None:
     one, _, alike, _ = _two_pictures(0.0, 2)
     _, other, _, noisy = _two_pictures(0.0, 3)
     stated = Relative(np.eye(3), np.array([0.0, 0.0, 1.2]), np.radians(0.2), 0.05)
-    assert len(matches((one, alike), (other, noisy), stated, PIXEL_RAD)) == 0
+    assert len(matches((one, alike), (other, noisy), stated, PIXEL_RAD)[0]) == 0
 
 
 def test_tracks_join_pairs_and_leave_out_what_is_ambiguous() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.adjustment import Adjustment
+from roadscan.adjust.bundle.depths import Surfaces, depth_rows
 from roadscan.adjust.bundle.measurements import Measurements, State, met_at, residuals_px, seen
 from roadscan.adjust.bundle.solve import Approached, PictureEvidence, state_of
 from roadscan.adjust.control.control import ControlPoint
@@ -43,6 +44,21 @@ class ControlOfPictures:
 
 
 @dataclass(frozen=True)
+class DepthOutcome:
+    """Distances of tie points from k surfaces of lidars."""
+
+    surfaces: Surfaces
+    before_m: Float64
+    """(k,) with the recorded poses and stated mountings."""
+    after_m: Float64
+    """(k,) with what was adjusted."""
+    sigma_m: Float64
+    """(k,)"""
+    weight: Float64
+    """(k,) 1 = counts fully, 0 = rejected."""
+
+
+@dataclass(frozen=True)
 class PictureOutcome:
     """Residuals of m measurements, and control points."""
 
@@ -63,6 +79,10 @@ class PictureOutcome:
     bounds: tuple[float, float]
     """Between which it lies with a chance of 95 %."""
     notes: tuple[str, ...]
+    depths: DepthOutcome | None = None
+    """Distances from surfaces of lidars; None where there are none."""
+    moving: int = 0
+    """Tie points that lidars saw elsewhere."""
 
     def rms_px(self, *, after: bool) -> float:
         """Returns the root mean square of each coordinate of tie points, each counting by its weight."""
@@ -98,8 +118,27 @@ def outcome_of(approach: Approached, adjusted: Adjustment, points: Sequence[Cont
     names = tuple(named[k].name if k >= 0 else "" for k in pictures.control.tolist())
     return PictureOutcome(
         measured, before, after, np.where(pictures.enters, weight, np.nan), tuple(control), names, approach.sigma_px,
-        squares / degrees, (low, high), pictures.notes,
+        squares / degrees, (low, high), pictures.notes, _depths(approach, adjusted, state), int(approach.moving.size),
     )  # fmt: skip
+
+
+def _depths(approach: Approached, adjusted: Adjustment, state: State) -> DepthOutcome | None:
+    """Returns distances from surfaces; their rows come right before those of the pictures."""
+    surfaces, depths, pictures = approach.surfaces, approach.depths, approach.pictures
+    if surfaces is None or depths is None or not depths.surface.size:
+        return None
+    values, stated = [], (pictures.depth_sigma_m, approach.depth_weight)
+    for one in (State(), state):
+        where = seen(pictures.measured, one, pictures.numbers)
+        place = met_at(pictures.measured, where, np.where(pictures.enters, approach.weight, 0.0))
+        first = np.arange(len(place))
+        rows = depth_rows(pictures.measured, surfaces, one, pictures.numbers, (place, first), *stated)
+        values.append(rows.value_m[depths.surface])
+    last = adjusted.weight.size - approach.rows.measurement.size
+    weight = adjusted.weight[last - depths.surface.size : last]
+    weight = weight * approach.depth_weight[surfaces.measurement[depths.surface]]
+    before, after = values
+    return DepthOutcome(surfaces.at(depths.surface), before, after, depths.observations.sigma_m, weight)
 
 
 def _residuals(pictures: PictureEvidence, state: State, weight: Float64) -> Float64:

@@ -34,5 +34,16 @@ class CameraPriors(Strict):
     """1 σ of what all measurements of a picture are off in common (px): what the lens model leaves, and features that
     look different from nearer. Without it, thousands of tie points would believe their mean to hundredths of a pixel,
     and bend mountings, lens and control by what they share."""
+    depths: bool = True
+    """Whether tie points that lie on a surface which a lidar of the same run saw at the moment of the picture are held
+    to it."""
+    depth_every_m: float = Field(default=2.0, gt=0.0, le=100.0)
+    """Pictures of a camera that far apart (m) are looked at for that."""
+    depth_reach_m: float = Field(default=40.0, gt=1.0, le=200.0)
+    """Returns of the lidar farther from the camera (m) are not used."""
+    sigma_depth_m: float = Field(default=0.03, gt=0.0, le=1.0)
+    """1 σ of the distance of a tie point from such a surface, beside the scatter of the returns (m)."""
+    sigma_shared_depth_m: float = Field(default=0.01, ge=0.0, le=1.0)
+    """1 σ of what all of them in a picture are off in common (m): ranges that depend on brightness, and beams."""
     sigma_control_px: float = Field(default=0.3, gt=0.0, le=10.0)
     """1 σ of each pixel coordinate of a control point, where the measurement states none (px)."""

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.adjustment import Adjustment, adjust
+from roadscan.adjust.bundle.depths import DepthRows, NearReturns, Surfaces, depth_rows, surfaces_of
 from roadscan.adjust.bundle.measurements import (
     Measurements,
     Numbers,
@@ -48,6 +49,11 @@ _SIGMA_PX: Final = (0.05, 3.0)
 """Bounds of the measured σ of a tie point (px): SIFT reaches 0.1 at best, and beyond 3 px nothing was matched."""
 _BEYOND: Final = 1_000_000_000
 """Number of the first tie point as a place: more control points than this are in no survey, and these come first."""
+_LOOKS: Final = 5
+"""Solutions up to which surfaces are looked up anew: by then mounting and lens are off by less than a pixel."""
+_ELSEWHERE_M: Final = 0.5
+"""A tie point farther than this from a surface that the lidar saw there (m) is of something that moves …"""
+_ELSEWHERE: Final = 6.0  # … if that is so many σ as well.
 _GROSS: Final = 12.0
 """At the start, a measurement farther than so many median residuals from its point is left out."""
 
@@ -67,6 +73,10 @@ class PictureEvidence:
     shared_px: float
     """1 σ of what the measurements of a picture are off in common (px)."""
     notes: tuple[str, ...] = ()
+    returns: tuple[NearReturns, ...] = ()
+    """What lidars saw about tie points."""
+    depth_sigma_m: tuple[float, float] = (0.03, 0.01)
+    """1 σ of the distance of a tie point from a surface of the lidar, and of what all of a picture are off (m)."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +93,14 @@ class Approached:
     """1 σ of a tie point; NaN where there is none."""
     others: tuple[Observations, int]
     """All other observations, and the place that stands for control point 0."""
+    surfaces: Surfaces | None
+    """Surfaces of lidars at tie points; None where there are none."""
+    depths: DepthRows | None
+    """Their rows: those of tie points that they do not contradict as things that move."""
+    depth_weight: Float64
+    """(m,) weight of the depth at each measurement."""
+    moving: Int64
+    """Numbers of the tie points that lidars saw elsewhere, as things that move, and which do not count."""
 
 
 def state_of(found: Adjustment) -> State:
@@ -122,29 +140,81 @@ def approached(
     priors = [one.faster(_FASTER, _FASTER) for one in priors]
     state, weight, heavy = State(), _at_start(pictures), 1.0
     before, settled = np.zeros((0, 2)), False
+    surfaces: Surfaces | None = None
+    depths: DepthRows | None = None
+    moving, depth_weight = np.zeros(0, np.int64), np.ones(pictures.measured.point.size)
     for number in range(1, _MOST + 1):
         measured = pictures.measured
         where = seen(measured, state, pictures.numbers)
-        rows = entering(pictures, where, (met_at(measured, where, weight), first), weight, heavy)
+        place_m = met_at(measured, where, weight)
+        rows = entering(pictures, where, (place_m, first), weight, heavy)
+        if number <= _LOOKS:
+            surfaces = surfaces_of(measured, pictures.returns, state, pictures.numbers)
+        depths = _depths(pictures, surfaces, state, (place_m, first), depth_weight)
         if len(before):
             settled = number > _WIDE.size and _change(before, rows.residual_px, weight) < _SETTLED_PX
         if settled or number == _MOST:
             break
         before = rows.residual_px
-        joined = Observations.joined([others[0], rows.observations])
+        more = Observations.none() if depths is None else depths.observations
+        joined = Observations.joined([others[0], more, rows.observations])
         found = adjust(joined, priors, quiet, mountings, pictures.cameras)
         state = state_of(found)
         wide = float(_WIDE[min(number, _WIDE.size) - 1])
-        lengths, root = _judged(pictures, rows, found, others[0].size)
+        lengths, root = _judged(pictures, rows, found, others[0].size + more.size)
         limits = settings.full_weight_within * wide, settings.reject_beyond * wide
+        if surfaces is not None and depths is not None:
+            off = _off_surfaces(depths, found, others[0].size)
+            depth_weight = np.ones(depth_weight.size)
+            depth_weight[surfaces.measurement[depths.surface]] = igg_iii(off[1], *limits)
+            moving = _moving(pictures.measured.point[surfaces.measurement[depths.surface]], off)
         weight, factor = _weights(pictures, state, (lengths, weight), limits)
         heavy = max(heavy * root / factor, 1.0) if number > _WIDE.size else 1.0
         pictures = _with_sigma(pictures, factor)
     tied = pictures.measured.sigma_px[pictures.measured.is_tie]
     sigma = float(np.median(tied)) if tied.size else float("nan")
+    if moving.size:
+        weight = np.where(np.isin(pictures.measured.point, moving), 0.0, weight)
+        rows = entering(pictures, where, (place_m, first), weight, heavy)
+        place_m = np.where(np.isin(np.arange(len(place_m)), moving)[:, None], np.nan, place_m)
+        depths = _depths(pictures, surfaces, state, (place_m, first), depth_weight)
     entered = np.isin(np.arange(weight.size), rows.measurement)
     weight = np.where(entered, weight, 0.0)
-    return Approached(pictures, sharing(rows, pictures, weight), weight, sigma, others)
+    rows = sharing(rows, pictures, weight)
+    return Approached(pictures, rows, weight, sigma, others, surfaces, depths, depth_weight, moving)
+
+
+def _depths(
+    pictures: PictureEvidence, surfaces: Surfaces | None, state: State, points: tuple[Float64, Int64], weight: Float64
+) -> DepthRows | None:
+    """Returns the rows of surfaces about a state; of a tie point that does not count there are none."""
+    if surfaces is None:
+        return None
+    return depth_rows(pictures.measured, surfaces, state, pictures.numbers, points, pictures.depth_sigma_m, weight)
+
+
+def _off_surfaces(depths: DepthRows, found: Adjustment, others: int) -> tuple[Float64, Float64]:
+    """Returns distances (r,) of tie points from their surfaces by the prediction of all other rows (m), and the same in
+    the σ that they have alone, whatever their weight.
+    """
+    own = slice(others, others + depths.surface.size)
+    left_out = np.abs(found.residual_m[own] / found.redundancy[own])
+    predicted = (left_out / found.normalised_residual[own]) ** 2 - depths.observations.sigma_m**2
+    return left_out, left_out / np.sqrt(np.maximum(predicted, 0.0) + depths.alone_sigma_m[depths.surface] ** 2)
+
+
+def _moving(point: Int64, off: tuple[Float64, Float64]) -> Int64:
+    """Returns numbers of the tie points that most of their surfaces contradict by far: what moves along the epipolar
+    lines, as a car ahead does, has its rays meet at a wrong distance.
+
+    Parameters
+    ----------
+    point : (r,) of each row.
+    off : distances (m) and the same in σ.
+    """
+    far = (off[0] > _ELSEWHERE_M) & (off[1] > _ELSEWHERE)
+    size = int(point.max(initial=-1)) + 1
+    return np.flatnonzero(2 * np.bincount(point[far], minlength=size) > np.bincount(point, minlength=size))
 
 
 def sharing(rows: Rows, pictures: PictureEvidence, weight: Float64) -> Rows:

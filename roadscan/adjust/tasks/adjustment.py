@@ -18,7 +18,8 @@ from roadscan.adjust.places import Place, Track, places_of_overlap
 from roadscan.adjust.process import RunPrior
 from roadscan.adjust.quality import NSSDA_CHECK_POINTS
 from roadscan.adjust.settings import AdjustConfig
-from roadscan.adjust.tasks.bundle import asks_pictures, pictures_key, pictures_of
+from roadscan.adjust.tasks.bundle import pictures_key, pictures_of
+from roadscan.adjust.tasks.camera_priors import asks_pictures
 from roadscan.adjust.tasks.cameras import (
     camera_findings,
     picture_findings,
@@ -63,6 +64,7 @@ from roadscan.adjust.tasks.outcome import ADJUSTMENT, PICTURES, SOLUTION, TABLES
 from roadscan.adjust.tasks.publication import digests_of, foreign_runs, publish
 from roadscan.adjust.tasks.seams import shown_seams
 from roadscan.adjust.tasks.solution import Evidence, Solution, priors_of, solve
+from roadscan.adjust.tasks.tie_depths import RETURNS, DepthTask, write_returns
 from roadscan.adjust.tasks.tie_work import TIES, KnownTies, TieTask, collect_ties, load_ties, tie_tasks
 from roadscan.adjust.tasks.ties_again import Again, first_ties, settled
 from roadscan.adjust.tasks.tracks import adjusted_sources, runs_of, tracks_of
@@ -159,7 +161,7 @@ def why_due(plan: SurveyPlan, manifest: Manifest) -> str:
         return "" if record is None else "switched off"
     if record is None or record.key != solution_key(plan, manifest):
         return MISSING if record is None else CHANGED
-    parts = [r for name in (TIES, SIGHTINGS, *TABLES, PICTURES) for r in manifest.of(name).values()]
+    parts = [r for name in (TIES, SIGHTINGS, RETURNS, *TABLES, PICTURES) for r in manifest.of(name).values()]
     whole = all(manifest.is_current(r.product, r.unit, r.key) and _is_drawn(r) for r in parts)
     return "" if whole and record.figures()["table"] == digests_of(plan.store) else DAMAGED
 
@@ -172,7 +174,7 @@ def _is_drawn(record: OutputRecord) -> bool:
 def withdraw(session: Session) -> None:
     """Remove the stage's products: the recorded poses are used."""
     manifest, plan = session.manifest, poses_plan_of(session)
-    manifest.remove([r for name in (TIES, SIGHTINGS, *TABLES, PICTURES) for r in manifest.of(name).values()])
+    manifest.remove([r for name in (TIES, SIGHTINGS, RETURNS, *TABLES, PICTURES) for r in manifest.of(name).values()])
     publish(session.store, {}, AdjustConfig.of(plan.survey))
     publish_mountings(session.store, None, AdjustConfig.of(plan.survey))
     publish_cameras(session.store, None)
@@ -192,14 +194,27 @@ class _Collector:
         self.of_heads, self._useless = self._heads()
         """Findings on heads that do not meet as they should."""
         plan = poses_plan_of(session)
-        keys = [one.key for one in self.mounted.priors]
-        self._pictures = pictures_of(plan, session.manifest, self.runs, keys, self.work.points)
+        self._pictures = pictures_of(
+            plan, session.manifest, self.runs, self.mounted, self.work.points, self._collect_depths
+        )
         tools = self.observe, self.load
         self.again = first_ties(plan, sources, self.work.ties, self.work.control, tools)
 
     def observe(self, tasks: Sequence[TieTask]) -> None:
         """Update ties."""
         self.lacks |= _collect_ties(self.session, tasks)
+
+    def _collect_depths(self, tasks: Sequence[DepthTask]) -> None:
+        """Update what lidars saw about the tie points of pictures."""
+        manifest = self.session.manifest
+        due = [t for t in tasks if not manifest.is_current(RETURNS, t.unit, t.key)]
+        ended = run_bundles(
+            write_returns, due, lambda t: sum(f.bytes for f in t.files), _BUNDLE_BYTES, manifest, self.session.compute,
+            self.session.bar("depths of tie points"),
+        )  # fmt: skip
+        self.session.failed("adjust", [(task.unit, reason) for task, reason in ended])
+        self.lacks |= bool(ended)
+        manifest.remove(manifest.beside([RETURNS], {t.unit for t in tasks}))
 
     def load(self, tasks: Sequence[TieTask]) -> KnownTies:
         """Returns ties that are up to date."""

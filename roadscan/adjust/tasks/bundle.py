@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -12,21 +12,22 @@ from roadscan.adjust.bundle.measurements import Measurements, Numbers
 from roadscan.adjust.bundle.settings import CameraPriors
 from roadscan.adjust.bundle.solve import PictureEvidence
 from roadscan.adjust.control.control import ControlPoint
-from roadscan.adjust.observations import CAMERA
 from roadscan.adjust.process import CameraPrior
 from roadscan.adjust.settings import AdjustConfig
+from roadscan.adjust.tasks.camera_priors import adjusted_cameras, asks_pictures, camera_sigma
+from roadscan.adjust.tasks.mountings import Mounted
+from roadscan.adjust.tasks.tie_depths import DepthTask, depth_tasks, load_returns
 from roadscan.core.counted import listed
 from roadscan.core.ids import of_run
-from roadscan.core.rig import Sensor
-from roadscan.core.survey import Survey
 from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory_source
+from roadscan.georeference.plan.road import road_key
 from roadscan.georeference.sources import load_mountings
 from roadscan.navigation.tasks.clock_tables import load_clocks
 from roadscan.pictures.exposures import Exposures, exposures_of
 from roadscan.pictures.frames.chosen import camera_pictures
 from roadscan.pictures.points import TABLE, measured_points
-from roadscan.pictures.settings import PictureTiesConfig
-from roadscan.pictures.ties.work import ALL, TRACKS
+from roadscan.pictures.ties.chains import TRACKS
+from roadscan.pictures.ties.work import ALL
 from roadscan.store.manifest import Manifest, recorded_table
 from roadscan.store.store import Store
 
@@ -41,11 +42,6 @@ _BLUNT_PX: Final = 8.0
 is 0.19 px below 6 px, 0.26 at 8, 0.46 at 15, 0.62 at 30."""
 _BESIDE_NS: Final = 1_000_000_000
 """Time (ns) before the first picture and after the last one that corrections reach: clocks and rows are off by less."""
-
-
-def asks_pictures(survey: Survey) -> bool:
-    """Returns whether pictures take part in the adjustment."""
-    return survey.has(PictureTiesConfig.table) and PictureTiesConfig.of(survey).on
 
 
 def exposure_epochs(plan: SurveyPlan) -> dict[str, Int64]:
@@ -63,19 +59,13 @@ def exposure_span(epochs_gps_ns: Int64) -> tuple[int, int]:
     return int(epochs_gps_ns[0]) - _BESIDE_NS, int(epochs_gps_ns[-1]) + _BESIDE_NS
 
 
-def adjusted_cameras(survey: Survey) -> dict[str, Sensor]:
-    """Returns the cameras whose pictures take part, by name: those with an interior orientation."""
-    sensors = sorted(survey.rig.sensors.items()) if asks_pictures(survey) else ()
-    return {name: one for name, one in sensors if one.kind == "camera" and one.interior is not None}
-
-
 def pictures_key(plan: SurveyPlan, manifest: Manifest) -> list[Any]:
     """Returns what the evidence of pictures depends on, for the key of the solution. It reads no pose."""
     if not asks_pictures(plan.survey):
         return []
     tracks, cameras = manifest.get(TRACKS, ALL), adjusted_cameras(plan.survey)
     clocks, mountings = load_clocks(plan.store), load_mountings(plan.store)
-    logs = []
+    logs = list[list[Any]]()
     for record in plan.records:
         if record.tables.get("images") and record.sensor in cameras:
             posed = [file.digest for file in trajectory_source(record.run, plan.records).files]
@@ -84,38 +74,22 @@ def pictures_key(plan: SurveyPlan, manifest: Manifest) -> list[Any]:
         elif record.tables.get(TABLE):
             logs.append([record.key, record.run, record.sensor])
     stated = [[name, one.model_dump(mode="json")] for name, one in cameras.items()]
+    logs += [[s.key, *road_key(s), [f.digest for f in files]] for s, files in plan.sources if s.table == "returns"]
     return ["" if tracks is None else tracks.digest, plan.ground.max_gap_s, stated, logs]
 
 
-def camera_sigma(camera: Sensor, own: CameraPriors) -> tuple[Float64, Float64]:
-    """Returns 1 σ (7,) of a camera's mounting, `MOUNTED`, and (11,) of its lens and clock, `CAMERA`."""
-    lever = camera.lever_arm_sigma_m or (own.sigma_lever_m,) * 3
-    boresight = camera.boresight_sigma_deg or (own.sigma_boresight_deg,) * 3
-    mounted = np.array([*lever, *np.radians(boresight), 0.0])
-    interior = camera.interior
-    if interior is None:
-        return mounted, np.zeros(len(CAMERA))
-    focal = interior.sigma_focal_px or tuple(own.sigma_focal * f for f in interior.focal_px)
-    principal = interior.sigma_principal_px or tuple(own.sigma_principal * f for f in interior.focal_px)
-    bent = interior.sigma_distortion or (own.sigma_k1, 0.0, 0.0, 0.0, 0.0)
-    if interior.model == "equirectangular":
-        focal, principal, bent = (0.0, 0.0), (0.0, 0.0), (0.0,) * 5
-    line = interior.sigma_line_time_us
-    line = (own.sigma_line_time_us if interior.line_time_us else 0.0) if line is None else line
-    return mounted, np.array([*focal, *principal, *bent, own.sigma_clock_s, 1e-6 * line])
-
-
 def pictures_of(
-    plan: SurveyPlan, manifest: Manifest, runs: Sequence[str], mounted: Sequence[tuple[str, str]],
-    points: Sequence[ControlPoint],
+    plan: SurveyPlan, manifest: Manifest, runs: Sequence[str], mounted: Mounted, points: Sequence[ControlPoint],
+    collect: Callable[[Sequence[DepthTask]], None],
 ) -> PictureEvidence | None:  # fmt: skip
     """Returns the evidence of a survey's pictures; None where they take no part, or show nothing.
 
     Parameters
     ----------
     runs : by which observations number them.
-    mounted : run and sensor of the mountings that are estimated, by number.
+    mounted : the mountings that are estimated.
     points : control points of the survey.
+    collect : updates what lidars saw about tie points.
     """
     if not asks_pictures(plan.survey):
         return None
@@ -123,10 +97,10 @@ def pictures_of(
     sensors = sorted({camera.sensor for camera in exposures.cameras})
     priors = AdjustConfig.of(plan.survey).cameras
     cameras = tuple(CameraPrior(one, camera_sigma(plan.survey.rig.sensors[one], priors)[1]) for one in sensors)
-    seats = [("*", camera.sensor) for camera in exposures.cameras]
+    seats, keys = [("*", camera.sensor) for camera in exposures.cameras], [one.key for one in mounted.priors]
     numbers = Numbers(
         np.array([runs.index(camera.run) for camera in exposures.cameras], np.int32),
-        np.array([mounted.index(one) if one in mounted else -1 for one in seats], np.int32),
+        np.array([keys.index(one) if one in keys else -1 for one in seats], np.int32),
         np.array([sensors.index(camera.sensor) for camera in exposures.cameras], np.int32),
     )
     index = {_named(exposures, k): k for k in range(len(exposures))}
@@ -147,9 +121,16 @@ def pictures_of(
         np.concatenate([np.full((tied, 3), np.nan), place]), np.concatenate([np.full((tied, 2), np.nan), sigma]),
     )  # fmt: skip
     is_check = np.array([False] * tied + [p.role != "gcp" for p in surveyed], bool)
+    tasks = depth_tasks(
+        plan, exposures, (tracks.picture, tracks.pixel), priors,
+        lambda sensor: float(camera_sigma(plan.survey.rig.sensors[sensor], priors)[0][3:6].max()),
+    )  # fmt: skip
+    collect(tasks)
+    returns = load_returns(manifest, tasks, mounted, plan)
     named = np.concatenate([np.full(tied, -1), [p.number for p in surveyed]]).astype(np.int64)
     return PictureEvidence(
-        measured, numbers, cameras, named, ~is_check[measured.point], priors.sigma_shared_px, notes
+        measured, numbers, cameras, named, ~is_check[measured.point], priors.sigma_shared_px, notes, returns,
+        (priors.sigma_depth_m, priors.sigma_shared_depth_m),
     )  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, Final
 
 import numpy as np
@@ -134,7 +135,25 @@ def picture_rows(found: PictureOutcome | None) -> dict[str, Rows]:
                 "weight": _finite(found.weight[m]),
             }
         )  # fmt: skip
-    return {"picture_residuals": rows, "picture_control": [_control_row(one) for one in found.control]}
+    control = [_control_row(one) for one in found.control]
+    return {"picture_residuals": rows, "picture_control": control, "depth_residuals": list(_depth_rows(found))}
+
+
+def _depth_rows(found: PictureOutcome) -> Iterator[dict[str, Any]]:
+    """Yield rows of the table of distances from surfaces of lidars."""
+    if found.depths is None:
+        return
+    measured, depths = found.measured, found.depths
+    away = np.linalg.norm(depths.surfaces.point_body_m - depths.surfaces.lever_body_m, axis=1)
+    for k, m in enumerate(depths.surfaces.measurement.tolist()):
+        picture = int(measured.picture[m])
+        camera = measured.exposures.cameras[measured.exposures.camera[picture]]
+        yield {
+            "run": camera.run, "sensor": camera.sensor, "file": str(measured.exposures.file[picture]),
+            "track": int(measured.point[m]), "lidar": str(depths.surfaces.lidar[k]), "distance_m": float(away[k]),
+            "sigma_m": float(depths.sigma_m[k]), "before_m": _finite(depths.before_m[k]),
+            "after_m": _finite(depths.after_m[k]), "weight": float(depths.weight[k]),
+        }  # fmt: skip
 
 
 def _control_row(one: ControlOfPictures) -> dict[str, Any]:
@@ -236,6 +255,17 @@ def picture_lines(found: PictureOutcome | None, cameras: CameraErrors | None, fr
                 f"{counted(len(own), word[:-1])} in pictures: RMS in space {1e3 * was:.0f} mm before, "
                 f"{1e3 * now:.1f} mm after"
             )
+    if found.depths is not None:
+        holds = found.depths.weight > 0.0
+        was, now = (
+            float(np.nanmedian(np.abs(v[holds]))) if holds.any() else float("nan")
+            for v in (found.depths.before_m, found.depths.after_m)
+        )
+        lines.append(
+            f"{int(holds.sum()):,} of {holds.size:,} depths of the lidar at tie points count: half of them "
+            f"within {1e3 * was:.0f} mm before, {1e3 * now:.0f} mm after; "
+            f"{found.moving:,} tie points that it saw elsewhere (things that move) are left out"
+        )
     return [*lines, *_camera_lines(cameras, free), *found.notes]
 
 

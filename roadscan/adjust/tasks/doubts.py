@@ -114,6 +114,7 @@ _WORDS: Final = {
     "control_position": "places measured at control points",
     "picture_tie": "tie points in pictures",
     "picture_control": "control points in pictures",
+    "picture_depth": "distances of tie points in pictures from surfaces of the lidar",
     "control_survey": "the survey of the control points",
     "north_m": "the poses, north",
     "east_m": "the poses, east",

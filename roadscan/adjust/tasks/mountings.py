@@ -15,7 +15,7 @@ from roadscan.adjust.control.control_test import APART
 from roadscan.adjust.observations import MOUNTED
 from roadscan.adjust.process import MountingPrior
 from roadscan.adjust.settings import AdjustConfig
-from roadscan.adjust.tasks.bundle import adjusted_cameras, camera_sigma
+from roadscan.adjust.tasks.camera_priors import adjusted_cameras, camera_sigma
 from roadscan.adjust.tasks.near import Sources
 from roadscan.adjust.unknowns import sharing
 from roadscan.core.rig import Mountings

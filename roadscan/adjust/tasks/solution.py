@@ -302,7 +302,8 @@ def _adjusted(
     priors, cameras, approach = evidence.mounted.priors, list[CameraPrior](), None
     if evidence.pictures is not None and mode == "joint":
         approach = approached(evidence.pictures, (joined, first), evidence.priors, settings, priors)
-        joined = Observations.joined([joined, approach.rows.observations])
+        more = [] if approach.depths is None else [approach.depths.observations]
+        joined = Observations.joined([joined, *more, approach.rows.observations])
         cameras = list(evidence.pictures.cameras)
     filmed = np.array([one.sensor in evidence.mounted.cameras for one in priors], bool)
     for _ in range(_WIDENED):

@@ -15,8 +15,9 @@ from roadscan.export.pictures.chosen import LocalFrame
 from roadscan.measuring.measure import posed_pictures
 from roadscan.measuring.poses import PicturePoses
 from roadscan.pictures.lens import rays_of
+from roadscan.pictures.ties.chains import TRACKS
 from roadscan.pictures.ties.tracks import places_of
-from roadscan.pictures.ties.work import ALL, TRACKS
+from roadscan.pictures.ties.work import ALL
 from roadscan.pictures.views import Views
 from roadscan.run.session import Session
 from roadscan.store.manifest import recorded_table

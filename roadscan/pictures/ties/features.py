@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.extras import cv2
+from roadscan.pictures.ties.sky import is_at, sky_of
 
 Float32 = npt.NDArray[np.float32]
 UInt8 = npt.NDArray[np.uint8]
@@ -24,6 +25,8 @@ _CELLS: Final = (12, 8)
 _LARGE_PX: Final = 4.0
 """Diameter of a feature (px) beyond which it comes after all smaller ones of its cell: its middle moves as it is seen
 from nearer, by some hundredths of a pixel a picture and always the same way, which bends a long drive."""
+FARTHEST: Final = 0.75
+"""Distance of two descriptors of unit length, at most: those of unlike places differ by 1.0 in the median."""
 _SCALE: Final = 255.0  # Scale of a descriptor's roots, which lie between 0 and 1, as bytes.
 _SAME_PX: Final = 1e-3  # Features so near each other (px) are one place with two directions.
 
@@ -38,6 +41,10 @@ class Features:
     """(k,) diameter."""
     descriptor: UInt8
     """(k, 128) roots of the shares of the gradients, times 255."""
+    of_sky: Bool
+    """(k,) True of what the picture by itself takes for sky."""
+    hidden: int = 0
+    """Features that were left out, as they lie on what the rig file says to be the vehicle."""
 
     def __len__(self) -> int:
         """Returns the number of features."""
@@ -53,10 +60,12 @@ def features_of(picture: UInt8, most: int, hidden: Bool | None = None) -> Featur
     """
     height, width = picture.shape
     finder = cv2.SIFT.create(nfeatures=0, contrastThreshold=_CONTRAST, enable_precise_upscale=True)
-    shown = None if hidden is None or not hidden.size else np.where(hidden, 0, 255).astype(np.uint8)
-    found = finder.detect(picture, shown)
+    every = finder.detect(picture, None)
+    found = [one for one in every if hidden is None or not hidden.size or not hidden[_pixel(one, picture)]]
+    left_out, none = len(every) - len(found), np.zeros(0, np.float32)
     if not found:
-        return Features(np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros((0, DESCRIPTOR), np.uint8))
+        nothing = np.zeros((0, DESCRIPTOR), np.uint8)
+        return Features(none.reshape(0, 2), none, nothing, np.zeros(0, bool), left_out)
     values = np.array([(*one.pt, one.size, one.response, one.angle) for one in found])
     order = np.lexsort(
         (values[:, 4], values[:, 2], values[:, 0], values[:, 1], -values[:, 3], values[:, 2] > _LARGE_PX)
@@ -68,7 +77,21 @@ def features_of(picture: UInt8, most: int, hidden: Bool | None = None) -> Featur
     size = np.array([one.size for one in kept], np.float32)
     share = raw / np.maximum(raw.sum(axis=1, keepdims=True), 1e-9)
     descriptor = np.clip(np.rint(_SCALE * np.sqrt(share)), 0, _SCALE).astype(np.uint8)
-    return Features(place, size, descriptor)
+    return Features(place, size, descriptor, is_at(sky_of(picture), place, (width, height)), left_out)
+
+
+def alike(first: UInt8, second: UInt8) -> Bool:
+    """Returns whether pairs (k,) of descriptors (k, 128) are of places that look alike."""
+    one, other = (values.astype(np.float32) for values in (first, second))
+    length = np.linalg.norm(one, axis=1) * np.linalg.norm(other, axis=1)
+    likeness = np.einsum("ni,ni->n", one, other) / np.maximum(length, 1e-6)
+    return np.asarray(2.0 - 2.0 * likeness < FARTHEST**2)
+
+
+def _pixel(point: cv2.KeyPoint, picture: UInt8) -> tuple[int, int]:
+    """Returns row and column of the pixel of a feature."""
+    column, row = (int(value + 0.5) for value in point.pt)
+    return min(row, picture.shape[0] - 1), min(column, picture.shape[1] - 1)
 
 
 def _first_at_place(place_px: npt.NDArray[np.float64]) -> Int64:

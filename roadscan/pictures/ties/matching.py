@@ -8,6 +8,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.pictures.ties.features import FARTHEST
+
 Float64 = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
 Int64 = npt.NDArray[np.int64]
@@ -16,8 +18,6 @@ Bool = npt.NDArray[np.bool_]
 
 _RATIO: Final = 0.85
 """Distance to the best descriptor over that to the second best in the band, at most; Lowe (2004) takes 0.8 over all."""
-_FARTHEST: Final = 0.75
-"""Distance of two descriptors of unit length, at most: those of unlike places differ by 1.0 in the median."""
 _STEPS: Final = 12  # Rounds of re-weighting from the width of the band down to the noise of a feature.
 _NOISE_PX: Final = 1.0
 """1 σ of the place of a feature across the epipolar line (px), for the last rounds."""
@@ -46,8 +46,11 @@ class Relative:
     """1 σ of the direction of the base about each axis."""
 
 
-def matches(first: tuple[Float64, UInt8], second: tuple[Float64, UInt8], relative: Relative, pixel_rad: float) -> Int64:
-    """Returns rows (m, 2) of the features of two pictures that show the same place.
+def matches(
+    first: tuple[Float64, UInt8], second: tuple[Float64, UInt8], relative: Relative, pixel_rad: float
+) -> tuple[Int64, int]:
+    """Returns rows (m, 2) of the features of two pictures that show the same place, and how many other ones look alike
+    but contradict the epipolar geometry: what moved, and what is alike by chance.
 
     Candidates are mutually the best in the band about the epipolar line that follows from the σ of the poses. The
     relative pose is then estimated from all of them, with weights that become narrower from round to round (graduated
@@ -60,17 +63,18 @@ def matches(first: tuple[Float64, UInt8], second: tuple[Float64, UInt8], relativ
     """
     none = np.zeros((0, 2), np.int64)
     if np.linalg.norm(relative.base) < _LEAST_BASE_M or not len(first[0]) or not len(second[0]):
-        return none
+        return none, 0
     # A base that is known badly in relation to its length turns the epipolar lines.
     sigma = float(np.hypot(relative.sigma_turn_rad, min(relative.sigma_direction_rad, _LOOSEST_RAD)))
     band = _WITHIN * (sigma + _NOISE_PX * pixel_rad)
     pairs = _alike(first, second, relative, band)
     if len(pairs) < _LEAST:
-        return none
+        return none, len(pairs)
     rays = first[0][pairs[:, 0]], second[0][pairs[:, 1]]
     away = _fitted(rays, relative, band, _NOISE_PX * pixel_rad)
     kept = np.abs(away) <= _WITHIN * _NOISE_PX * pixel_rad
-    return pairs[kept] if int(kept.sum()) >= _LEAST else none
+    found = pairs[kept] if int(kept.sum()) >= _LEAST else none
+    return found, len(pairs) - len(found)
 
 
 def _alike(first: tuple[Float64, UInt8], second: tuple[Float64, UInt8], relative: Relative, band: float) -> Int64:
@@ -91,7 +95,7 @@ def _alike(first: tuple[Float64, UInt8], second: tuple[Float64, UInt8], relative
     mutual = likeness.argmax(axis=0)[best] == rows
     likeness[rows, best] = -1.0
     distance, next_best = np.sqrt(np.maximum(2.0 - 2.0 * top, 0.0)), np.sqrt(2.0 - 2.0 * likeness.max(axis=1))
-    good = mutual & (distance < _FARTHEST) & (distance < _RATIO * next_best) & (top > -1.0)
+    good = mutual & (distance < FARTHEST) & (distance < _RATIO * next_best) & (top > -1.0)
     return np.stack([rows[good], best[good]], axis=-1).astype(np.int64)
 
 

@@ -12,20 +12,20 @@ from roadscan.core.extras import need
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import poses_plan_of
+from roadscan.pictures.ties.chains import CHAINS, TRACKS, chains_key, write_chains
+from roadscan.pictures.ties.own_vehicle import OWN_VEHICLE
 from roadscan.pictures.ties.refining import REFINED, refine_picture, refine_tasks, tracks_key, write_tracks
 from roadscan.pictures.ties.work import (
     ALL,
-    CHAINS,
     FEATURES,
     MATCHES,
-    TRACKS,
     TieWork,
-    chains_key,
     find_features,
+    find_own_vehicle,
     match_picture,
     match_tasks,
+    own_vehicle_tasks,
     plan_ties,
-    write_chains,
 )
 from roadscan.run.engine.bundles import run_bundles
 from roadscan.run.session import Session
@@ -62,7 +62,16 @@ WRONG_WAY: Final = Witness(
 )
 
 
-_TABLES: Final = (FEATURES, MATCHES, CHAINS, REFINED, TRACKS)
+MASKS: Final = {
+    "hidden": "features on the vehicle itself (own_vehicle_px of the rig file)",
+    "own_vehicle": "features on what stands still in the picture",
+    "against": "pairs of features that contradict the epipolar geometry (things that move, false matches)",
+    "sky": "chains of the sky (above the horizon, without parallax or of its look)",
+    "far": "chains too far away or with too little parallax",
+}
+"""Figures of the chains by their names, with what they count."""
+
+_TABLES: Final = (FEATURES, OWN_VEHICLE, MATCHES, CHAINS, REFINED, TRACKS)
 """What the stage writes, each from the one before."""
 
 
@@ -91,6 +100,13 @@ class PictureTies(Stage):
             find_features, due, lambda _: 1, _PICTURES, manifest, session.compute, session.bar("features of pictures")
         )
         session.failed(self.name, [(str(task.path), reason) for task, reason in failed])
+        seen = own_vehicle_tasks(work, manifest)
+        unseen = run_bundles(
+            find_own_vehicle, [t for t in seen if not manifest.is_current(OWN_VEHICLE, t.unit, t.key)],
+            lambda t: len(t.records), _PICTURES, manifest, session.compute, session.bar("cameras: their own vehicle"),
+        )  # fmt: skip
+        session.failed(self.name, [(t.unit, reason) for t, reason in unseen])
+        manifest.remove(manifest.beside([OWN_VEHICLE], {t.unit for t in seen}))
         tasks = match_tasks(work, manifest)
         left = [t for t in tasks if not manifest.is_current(MATCHES, t.unit, t.key)]
         unmatched = run_bundles(
@@ -142,6 +158,8 @@ class PictureTies(Stage):
             return StageState()
         work, manifest = plan_ties(poses_plan_of(session)), session.manifest
         state = StageState.of(manifest, [(FEATURES, t.unit, t.key) for t in work.features])
+        seen = own_vehicle_tasks(work, manifest)
+        state.join(StageState.of(manifest, [(OWN_VEHICLE, t.unit, t.key) for t in seen]))
         tasks = match_tasks(work, manifest)
         state.join(StageState.of(manifest, [(MATCHES, t.unit, t.key) for t in tasks]))
         chains = chains_key(work, tasks, manifest)
@@ -192,5 +210,6 @@ def _lines(work: TieWork, manifest: Manifest) -> list[str]:
     return [
         f"{len(work.units):,} pictures, {len(work.pairs):,} pairs compared: {own['found']:,} tie points, of which "
         f"{own['tracks']:,} are kept (long ones first, spread over the pictures); least-squares matching finds "
-        f"{own['matched']:,} of {own['compared']:,} of their places"
+        f"{own['matched']:,} of {own['compared']:,} of their places",
+        "left out at tie points: " + "; ".join(f"{own[word]:,} {what}" for word, what in MASKS.items() if word in own),
     ]

@@ -21,8 +21,9 @@ from roadscan.pictures.lens import rays_of
 from roadscan.pictures.settings import PictureTiesConfig
 from roadscan.pictures.ties.features import DESCRIPTOR, Features, features_of
 from roadscan.pictures.ties.matching import Relative, matches
+from roadscan.pictures.ties.own_vehicle import OWN_VEHICLE, cells_from, cells_of, compare, compared_pictures, detail_of
+from roadscan.pictures.ties.own_vehicle import rows_of as rows_of_cells
 from roadscan.pictures.ties.pairs import pairs_of
-from roadscan.pictures.ties.tracks import places_of, spread, tracks_of, widest_parallax_rad
 from roadscan.pictures.views import Lens
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
@@ -35,12 +36,10 @@ from roadscan.store.writer import parquet_bytes
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
-UInt8 = npt.NDArray[np.uint8]
+Bool = npt.NDArray[np.bool_]
 
 FEATURES: Final = "picture_features"
 MATCHES: Final = "picture_matches"
-CHAINS: Final = "picture_chains"
-TRACKS: Final = "picture_tracks"
 ALL: Final = "all"
 """Unit of chains and tracks in the manifest."""
 
@@ -69,6 +68,19 @@ class FeatureTask:
 
 
 @dataclass(frozen=True)
+class OwnVehicleTask:
+    """Some pictures of a camera, spread over its drive."""
+
+    store: Store
+    exposures: Exposures
+    lens: Lens
+    records: tuple[OutputRecord | None, ...]
+    """Features of each of the pictures."""
+    unit: str
+    key: str
+
+
+@dataclass(frozen=True)
 class Partner:
     """A picture that another one is compared with."""
 
@@ -76,6 +88,8 @@ class Partner:
     """Unit of its features."""
     lens: Lens
     relative: Relative
+    own_vehicle: Bool | None
+    """Cells of its camera's pictures that show the vehicle."""
 
 
 @dataclass(frozen=True)
@@ -88,6 +102,8 @@ class MatchTask:
     records: tuple[OutputRecord, ...]
     """Features of the others."""
     lens: Lens
+    own_vehicle: Bool | None
+    """Cells of its camera's pictures that show the vehicle."""
     partners: tuple[Partner, ...]
     number: int
     """Number of the picture."""
@@ -144,7 +160,11 @@ def find_features(task: FeatureTask) -> OutputRecord:
         # The picture is lost, and named; another one may stand in its place by the next run.
         return OutputRecord(FEATURES, task.unit, task.key, "", 0, "", json.dumps({"features": 0, "why": str(error)}))
     found = features_of(picture, task.most, task.lens.hidden)
-    detail: dict[str, object] = {"features": len(found), "content": bytes_digest(picture.tobytes())}
+    detail: dict[str, object] = {
+        "features": len(found),
+        "hidden": found.hidden,
+        "content": bytes_digest(picture.tobytes()),
+    }
     if len(found) < _BLACK:
         grey = f"mean grey value {picture.mean():.0f}"
         detail["why"] = f"it shows {len(found)} features ({grey}): black, blank or covered"
@@ -157,6 +177,7 @@ def find_features(task: FeatureTask) -> OutputRecord:
                 pa.array(np.arange(0, DESCRIPTOR * len(found) + 1, DESCRIPTOR), pa.int32()),
                 pa.array(found.descriptor.ravel()),
             ),
+            pa.array(found.of_sky.astype(np.uint8)),
         ],
         schema=schema.arrow(),
     )  # fmt: skip
@@ -176,28 +197,33 @@ def match_tasks(work: TieWork, manifest: Manifest) -> list[MatchTask]:
     """Returns a task for each picture that has features and is compared with others that have some."""
     code = code_digest(f"{__name__}:match_picture")
     left_out = {number for number, _ in odd_pictures(work, manifest)}
-    tasks = []
+    tasks, vehicles = [], _own_vehicles(work, manifest)
     starts = np.searchsorted(work.pairs[:, 0], np.arange(len(work.units) + 1))
     for first, record in enumerate(manifest.get(FEATURES, unit) for unit in work.units):
         others = [int(k) for k in work.pairs[starts[first] : starts[first + 1], 1] if int(k) not in left_out]
         found = [(k, r) for k in others if (r := manifest.get(FEATURES, work.units[k])) is not None and r.path]
         if record is None or not record.path or first in left_out or not found:
             continue
-        partners = tuple(_partner(work, first, k) for k, _ in found)
+        partners = tuple(_partner(work, first, k, vehicles) for k, _ in found)
         shaping = [[p.unit, p.relative.turn.round(6).tolist(), p.relative.base.round(4).tolist()] for p in partners]
         sigmas = [[p.relative.sigma_turn_rad, p.relative.sigma_direction_rad] for p in partners]
         lenses = [work.camera(k).lens.parameters.tolist() for k in (first, *(k for k, _ in found))]
-        key = key_of(code, record.digest, [r.digest for _, r in found], shaping, sigmas, lenses)
+        own = vehicles[int(work.exposures.camera[first])]
+        masks = [
+            None if one is None else np.packbits(one).tobytes().hex()
+            for one in (own, *(p.own_vehicle for p in partners))
+        ]
+        key = key_of(code, record.digest, [r.digest for _, r in found], shaping, sigmas, lenses, masks)
         tasks.append(
             MatchTask(
-                work.features[first].store, record, tuple(r for _, r in found), work.camera(first).lens, partners,
+                work.features[first].store, record, tuple(r for _, r in found), work.camera(first).lens, own, partners,
                 first, work.units[first], key,
             )
         )  # fmt: skip
     return tasks
 
 
-def _partner(work: TieWork, first: int, second: int) -> Partner:
+def _partner(work: TieWork, first: int, second: int, vehicles: Sequence[Bool | None]) -> Partner:
     """Returns the second picture as the recorded poses place it beside the first."""
     own = work.exposures.at(np.array([first, second]))
     turns, eyes = own.world_from_opencv, own.eye_world_m
@@ -214,35 +240,86 @@ def _partner(work: TieWork, first: int, second: int) -> Partner:
     if one.sensor != other.sensor:
         turn = float(np.hypot(turn, boresight))
     relative = Relative(turns[1].T @ turns[0], base, turn, float(np.hypot(shift, boresight)))
-    return Partner(work.units[second], work.camera(second).lens, relative)
+    return Partner(work.units[second], other.lens, relative, vehicles[int(own.camera[1])])
 
 
 def match_picture(task: MatchTask) -> OutputRecord:
     """Compare a picture with others and write what they have in common (runs on a worker)."""
-    own = _load(task.store, task.record)
+    own = load_features(task.store, task.record)
     pixel_rad = 1.0 / float(task.lens.parameters[:2].max())
-    first = rays_of(task.lens, own.pixel.astype(np.float64)), own.descriptor
-    names, rows = list[str](), list[Int64]()
+    shown = _beside_vehicle(own, task.lens, task.own_vehicle)
+    first = rays_of(task.lens, own.pixel[shown].astype(np.float64)), own.descriptor[shown]
+    names, rows, against = list[str](), list[Int64](), 0
     for partner, record in zip(task.partners, task.records, strict=True):
-        other = _load(task.store, record)
-        second = rays_of(partner.lens, other.pixel.astype(np.float64)), other.descriptor
-        found = matches(first, second, partner.relative, pixel_rad)
+        other = load_features(task.store, record)
+        there = _beside_vehicle(other, partner.lens, partner.own_vehicle)
+        second = rays_of(partner.lens, other.pixel[there].astype(np.float64)), other.descriptor[there]
+        found, more = matches(first, second, partner.relative, pixel_rad)
         names += [partner.unit] * len(found)
-        rows.append(found)
+        rows.append(np.stack([shown[found[:, 0]], there[found[:, 1]]], axis=-1))
+        against += more
     joined = np.concatenate(rows)
     table = pa.Table.from_arrays(
         [pa.array(names, pa.string()), pa.array(joined[:, 0], pa.int32()), pa.array(joined[:, 1], pa.int32())],
         schema=table_schema(MATCHES).arrow(),
     )
-    return written(task.store, MATCHES, task.unit, task.key, table, json.dumps({"matches": len(joined)}))
+    detail = {"matches": len(joined), "own_vehicle": len(own) - shown.size, "against": against}
+    return written(task.store, MATCHES, task.unit, task.key, table, json.dumps(detail))
 
 
-def _load(store: Store, record: OutputRecord) -> Features:
+def _beside_vehicle(features: Features, lens: Lens, own_vehicle: Bool | None) -> Int64:
+    """Returns rows of the features that do not lie on the vehicle."""
+    if own_vehicle is None:
+        return np.arange(len(features))
+    return np.flatnonzero(~own_vehicle[cells_of(features, lens)])
+
+
+def load_features(store: Store, record: OutputRecord) -> Features:
     """Returns the features of a picture."""
     rows = recorded_table(store, record)
     pixel = np.stack([rows.column(name).to_numpy() for name in ("u_px", "v_px")], axis=-1)
     descriptor = rows.column("descriptor").combine_chunks().flatten().to_numpy()
-    return Features(pixel, rows.column("size_px").to_numpy(), descriptor.reshape(-1, DESCRIPTOR))
+    of_sky = rows.column("of_sky").to_numpy() > 0
+    return Features(pixel, rows.column("size_px").to_numpy(), descriptor.reshape(-1, DESCRIPTOR), of_sky)
+
+
+def own_vehicle_tasks(work: TieWork, manifest: Manifest) -> list[OwnVehicleTask]:
+    """Returns a task for each camera of a run that has pictures to be compared."""
+    code, tasks = code_digest(f"{__name__}:find_own_vehicle"), []
+    for number, camera in enumerate(work.exposures.cameras):
+        pictures = compared_pictures(work.exposures, number)
+        if camera.lens.is_around or pictures.size < 2:
+            continue
+        own = work.exposures.at(pictures)
+        records = tuple(manifest.get(FEATURES, work.units[k]) for k in pictures.tolist())
+        digests = ["" if one is None else one.digest for one in records]
+        posed = [v.round(4).tobytes().hex() for v in (own.world_from_opencv, own.eye_world_m, own.level_from_body)]
+        unit = key_of(camera.run, camera.sensor, camera.log)
+        key = key_of(code, digests, posed, camera.lens.parameters.tolist())
+        tasks.append(OwnVehicleTask(work.features[0].store, own, camera.lens, records, unit, key))
+    return tasks
+
+
+def find_own_vehicle(task: OwnVehicleTask) -> OutputRecord:
+    """Find what stands still in the pictures of a camera and write it (runs on a worker)."""
+
+    def load(number: int) -> Features | None:
+        record = task.records[number]
+        return None if record is None or not record.path else load_features(task.store, record)
+
+    found = compare(task.exposures, np.arange(len(task.exposures)), task.lens, load)
+    rows = pa.Table.from_arrays(rows_of_cells(found), schema=table_schema(OWN_VEHICLE).arrow())
+    return written(task.store, OWN_VEHICLE, task.unit, task.key, rows, detail_of(found))
+
+
+def _own_vehicles(work: TieWork, manifest: Manifest) -> list[Bool | None]:
+    """Returns the cells of each camera's pictures that show its vehicle; None where none do."""
+    found = list[Bool | None]()
+    for camera in work.exposures.cameras:
+        record = manifest.get(OWN_VEHICLE, key_of(camera.run, camera.sensor, camera.log))
+        there = record is not None and record.path and record.figures()["cells"]
+        found.append(cells_from(recorded_table(work.features[0].store, record)) if record and there else None)
+    return found
 
 
 def odd_pictures(work: TieWork, manifest: Manifest) -> list[tuple[int, str]]:
@@ -262,135 +339,3 @@ def odd_pictures(work: TieWork, manifest: Manifest) -> list[tuple[int, str]]:
         elif content is not None:
             before[content] = number
     return found
-
-
-def chains_key(work: TieWork, tasks: Sequence[MatchTask], manifest: Manifest) -> str:
-    """Returns the key of the chains."""
-    made = [(record.digest if (record := manifest.get(MATCHES, task.unit)) is not None else "") for task in tasks]
-    settings = work.settings.model_dump(mode="json")
-    return key_of(code_digest(f"{__name__}:write_chains"), settings, [task.key for task in tasks], made)
-
-
-def write_chains(work: TieWork, tasks: Sequence[MatchTask], manifest: Manifest, store: Store) -> OutputRecord:
-    """Join all matches to chains, and write those that are kept."""
-    number = {unit: k for k, unit in enumerate(work.units)}
-    counts = np.zeros(len(work.units), np.int64)
-    for k, unit in enumerate(work.units):
-        record = manifest.get(FEATURES, unit)
-        counts[k] = 0 if record is None or not record.path else json.loads(record.detail)["features"]
-    starts = np.concatenate([[0], np.cumsum(counts)])
-    first, second = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
-    for task in tasks:
-        record = manifest.get(MATCHES, task.unit)
-        if record is None or not record.path:
-            continue
-        rows = recorded_table(store, record)
-        names = rows.column("other").dictionary_encode().combine_chunks()
-        others = np.array([number[name] for name in names.dictionary.to_pylist()], np.int64)
-        first.append(starts[task.number] + rows.column("first").to_numpy())
-        second.append(starts[others[names.indices.to_numpy()]] + rows.column("second").to_numpy())
-    picture = np.repeat(np.arange(len(work.units)), counts)
-    features, track = tracks_of(np.concatenate(first), np.concatenate(second), picture)
-    pixel, size = _pixels(work, manifest, store, (features, picture[features], starts))
-    kept, figures = _kept(work, track, picture[features], pixel)
-    rows = rows_of(work, track[kept], picture[features][kept], (pixel[kept], size[kept]))
-    odd = [[work.exposures.name(number), why] for number, why in odd_pictures(work, manifest)]
-    detail = json.dumps({**figures, "odd": odd})
-    return written(store, CHAINS, ALL, chains_key(work, tasks, manifest), rows, detail)
-
-
-def _pixels(
-    work: TieWork, manifest: Manifest, store: Store, chosen: tuple[Int64, Int64, Int64]
-) -> tuple[Float64, Float64]:
-    """Returns places (m, 2) and diameters (m,) of some features; pictures are read one by one.
-
-    chosen : number of each feature, in order, its picture, and the first feature of every picture.
-    """
-    features, picture, starts = chosen
-    pixel, size = np.empty((features.size, 2)), np.empty(features.size)
-    ends = np.searchsorted(picture, np.arange(len(work.units) + 1))
-    for number in np.unique(picture).tolist():
-        record = manifest.get(FEATURES, work.units[number])
-        if record is None:
-            continue
-        own = slice(ends[number], ends[number + 1])
-        found, rows = _load(store, record), features[own] - starts[number]
-        pixel[own], size[own] = found.pixel[rows], found.size_px[rows]
-    return pixel, size
-
-
-def _kept(work: TieWork, track: Int64, picture: Int64, pixel: Float64) -> tuple[npt.NDArray[np.bool_], dict[str, int]]:
-    """Returns a mask (m,) of the measurements of tracks that are kept, and how many were left out for what.
-
-    A tie point has to lie before its cameras, within reach, and be seen from directions far enough apart.
-    """
-    if not track.size:
-        return np.zeros(0, bool), {"tracks": 0, "found": 0, "behind": 0}
-    sight = np.empty((track.size, 3))
-    sizes = np.empty((track.size, 2))
-    for camera in range(len(work.exposures.cameras)):
-        own = work.exposures.camera[picture] == camera
-        lens = work.exposures.cameras[camera].lens
-        sight[own], sizes[own] = rays_of(lens, pixel[own]), lens.size_px
-    eye = work.exposures.eye_world_m[picture]
-    ray = np.einsum("nij,nj->ni", work.exposures.world_from_opencv[picture], sight)
-    found = places_of(track, eye, ray)
-    wide = widest_parallax_rad(track, eye, found.place_m) >= np.radians(work.settings.least_parallax_deg)
-    near = np.ones(len(found.place_m), bool)
-    near[track[~((found.distance_m > 0.0) & (found.distance_m < work.settings.reach_m))]] = False
-    behind = np.zeros(len(found.place_m), bool)
-    behind[track[found.distance_m <= 0.0]] = True
-    good = np.flatnonzero(wide & near)
-    own = np.isin(track, good)
-    number = np.searchsorted(good, track[own])
-    chosen = spread(number, picture[own], pixel[own], sizes[own], work.settings.measurements)
-    kept = np.zeros(track.size, bool)
-    kept[np.flatnonzero(own)[chosen[number]]] = True
-    figures = {"tracks": int(chosen.sum()), "found": len(near), "behind": int(behind.sum())}
-    return kept, figures
-
-
-def rows_of(work: TieWork, track: Int64, picture: Int64, of_feature: tuple[Float64, Float64]) -> pa.Table:
-    """Returns rows of the tables of chains and tracks, by track and picture; tracks are numbered from 0."""
-    order = np.lexsort((picture, track))
-    exposures, rows = work.exposures, picture[order]
-    cameras = [exposures.cameras[k] for k in exposures.camera[rows].tolist()]
-    pixel, size = of_feature
-    return pa.Table.from_arrays(
-        [
-            pa.array(np.unique(track[order], return_inverse=True)[1], pa.int64()),
-            pa.array([c.run for c in cameras], pa.string()), pa.array([c.sensor for c in cameras], pa.string()),
-            pa.array([c.log for c in cameras], pa.string()),
-            pa.array(exposures.file[rows].tolist(), pa.string()), pa.array(pixel[order, 0], pa.float32()),
-            pa.array(pixel[order, 1], pa.float32()), pa.array(size[order], pa.float32()),
-        ],
-        schema=table_schema(TRACKS).arrow(),
-    )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Chains:
-    """What several pictures show, m measurements, as the features lie."""
-
-    track: Int64
-    """(m,) number of the tie point, ascending from 0."""
-    picture: Int64
-    """(m,) number of the picture."""
-    pixel: Float64
-    """(m, 2)"""
-    size_px: Float64
-    """(m,) diameter of the feature."""
-
-
-def chains_of(work: TieWork, manifest: Manifest, store: Store) -> Chains:
-    """Returns the chains of a survey, as they were written last."""
-    record = manifest.get(CHAINS, ALL)
-    if record is None or not record.path:
-        return Chains(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0))
-    rows = recorded_table(store, record)
-    logs = [work.exposures.cameras[k].log for k in work.exposures.camera.tolist()]
-    number = {one: k for k, one in enumerate(zip(logs, work.exposures.file.tolist(), strict=True))}
-    names = zip(*(rows.column(c).to_pylist() for c in ("log", "file")), strict=True)
-    pixel = np.stack([rows.column(name).to_numpy() for name in ("u_px", "v_px")], axis=-1)
-    picture = np.array([number[one] for one in names], np.int64)
-    return Chains(rows.column("track").to_numpy(), picture, pixel.astype(np.float64), rows.column("size_px").to_numpy())

@@ -8,6 +8,9 @@ from typing import Any, Final
 import pyarrow as pa
 
 from roadscan.adjust.tasks.outcome import FOLDER, PICTURES
+from roadscan.pictures.ties.chains import TRACKS
+from roadscan.pictures.ties.stage import MASKS
+from roadscan.pictures.ties.work import ALL
 from roadscan.report.blocks import Block, Paragraph, Picture, Table
 from roadscan.report.section import Material, Section
 from roadscan.run.session import Session
@@ -31,9 +34,20 @@ class Pictures(Section):
         if rows is None:
             return
         yield _cameras(rows)
+        tied = session.manifest.get(TRACKS, ALL)
+        if tied is not None:
+            figures = tied.figures()
+            yield Table(
+                ("left out at tie points", "number"),
+                [(what, f"{figures[word]:,}") for word, what in MASKS.items() if word in figures],
+                "What masks left out before the adjustment", "picture_masks",
+            )  # fmt: skip
         for record in session.manifest.of(PICTURES).values():
             if record.path.startswith(f"{FOLDER}/camera-") and session.store.exists(record.path):
                 yield Picture(material.picture(record.path), "Residuals of tie points, before and after", 170.0)
+        depths = _table(session, "depth_residuals")
+        if depths is not None and depths.num_rows:
+            yield _depths(depths)
         yield _worst(rows)
         control = _table(session, "picture_control")
         if control is not None:
@@ -68,6 +82,26 @@ def _cameras(rows: pa.Table) -> Table:
     return Table(
         ("run", "camera", "measurements", "RMS before (px)", "RMS after (px)"), listed,
         "Tie points that count; the RMS is that of one coordinate", "picture_residuals",
+    )  # fmt: skip
+
+
+def _depths(rows: pa.Table) -> Table:
+    used = rows.filter(pa.compute.greater(rows["weight"], 0.0))
+    by = ["run", "sensor", "lidar"]
+    sizes = {word: pa.compute.abs(used[f"{word}_m"]) for word in ("before", "after")}
+    grouped = pa.table({name: used[name] for name in by} | sizes).group_by(by)
+    told = [("before", "approximate_median"), ("after", "approximate_median"), ("after", "count")]
+    found = grouped.aggregate(told)
+    listed = [
+        (
+            one["run"], one["sensor"], one["lidar"], f"{one['after_count']:,}",
+            f"{1e3 * one['before_approximate_median']:.0f}", f"{1e3 * one['after_approximate_median']:.0f}",
+        )
+        for one in found.sort_by([(name, "ascending") for name in by]).to_pylist()
+    ]  # fmt: skip
+    return Table(
+        ("run", "camera", "lidar", "depths that count", "median before (mm)", "median after (mm)"), listed,
+        f"Tie points on surfaces of the lidar: {rows.num_rows - used.num_rows:,} more do not count", "depths",
     )  # fmt: skip
 
 

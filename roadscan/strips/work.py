@@ -161,23 +161,21 @@ def _stretches(own: Sequence[RawSlice]) -> list[tuple[int, int]]:
     return [(int(begin), int(begin) + length) for begin in begins]
 
 
-def _knots(recorded: Trajectory, span: tuple[int, int]) -> Int64:
-    """Returns the epochs (n,) of the recorded poses of a time span."""
-    epochs = recorded.epochs_gps_ns
-    return np.asarray(epochs[(epochs >= span[0]) & (epochs <= span[1])])
-
-
 def _way(recorded: Trajectory, ground: MapSettings, span: tuple[int, int]) -> Way | None:
-    """Returns the way within a time span, or its beginning; None where the vehicle stands or there are no poses."""
-    knots = _knots(recorded, span)
-    thin = knots[np.unique(knots // _STEP_NS, return_index=True)[1]]
+    """Returns the way within a time span, or its beginning; None where the vehicle stands or there are no poses.
+
+    It goes through recorded poses, so that `status`, which asks for it, loads no kernel.
+    """
+    epochs, apart = recorded.epochs_gps_ns, np.diff(recorded.epochs_gps_ns) > ground.max_gap_s * NS_PER_S
+    knots = np.flatnonzero((epochs >= span[0]) & (epochs <= span[1]))
+    thin = knots[np.unique(epochs[knots] // _STEP_NS, return_index=True)[1]]
     if thin.size < 2:
         return None
-    poses_at = level_poses(recorded, ground.map, thin)
-    body = poses_at.body_m
+    thin = thin[~np.append(apart, apart[-1])[thin]]
+    body = ground.map.map_from_world(recorded.world, recorded.position_world_m[thin])
     station = way_along(body)
     kept = station <= _LENGTH_M
-    return Way.of(body[kept], poses_at.epoch_gps_ns[kept]) if min(station[-1], _LENGTH_M) >= _LEAST_LENGTH_M else None
+    return Way.of(body[kept], epochs[thin][kept]) if min(station[-1], _LENGTH_M) >= _LEAST_LENGTH_M else None
 
 
 def _within(one: RawSlice, file: DataFile, span: tuple[int, int]) -> RawSlice | None:
@@ -263,7 +261,8 @@ def compare_strip(task: StripTask) -> OutputRecord:
     seen: list[tuple[SeenBy, Strip]] = []
     if way is not None:
         placer = Georeferencer(task.store, task.ground, task.slices, recorded=True)
-        sway = Sway.of(level_poses(recorded, task.ground.map, _knots(recorded, pad)))
+        epochs = recorded.epochs_gps_ns
+        sway = Sway.of(level_poses(recorded, task.ground.map, epochs[(epochs >= pad[0]) & (epochs <= pad[1])]))
         order = sorted(task.slices, key=lambda one: (one.source.run != task.run, one.source.run, one.source.sensor))
         for _, slices in itertools.groupby(order, lambda one: (one.source.run, one.source.sensor)):
             seen.append(_seen_by(task, placer, way, sway, list(slices)))

@@ -57,8 +57,6 @@ _MAKE_ROOM: Final = (
 
 _AT_ONCE_BYTES: Final = 16 << 20
 """Largest object (bytes) that is copied by one request and through memory."""
-_MANY_FILES: Final = 64
-"""Files whose folders are listed, where fewer are asked for one by one: a folder may hold many others."""
 
 MADE_AGAIN: Final = "run `roadscan verify`, which finds all such files; the next run then makes them again"
 """How a damaged product is repaired."""
@@ -118,28 +116,18 @@ class Store:
 
     def size(self, relative: str) -> int | None:
         """Return the bytes of a file, None where it is missing."""
-        if (look := self._look()) is not None:
-            with self._reached():
-                size = look.size(relative)
-            if size is not None or look.is_whole:
-                return size
+        path = f"{self.root}/{relative}"
         try:
-            return int(self.fs.size(self.path(relative)))
-        except FileNotFoundError:
+            if self.is_folder:
+                return os.stat(path).st_size  # noqa: PTH116 — of 400,000 files; a third of the time of others' ways
+            if (look := self._look()) is not None:
+                with self._reached():
+                    size = look.size(relative)
+                if size is not None or look.is_whole:
+                    return size
+            return int(self.fs.size(path))
+        except (FileNotFoundError, NotADirectoryError):
             return None
-
-    def sizes(self, paths: Sequence[str]) -> list[int | None]:
-        """Return the bytes of some files, None for each that is missing; folders with many of them are listed once."""
-        if not self.is_folder or len(paths) < _MANY_FILES:
-            return list(map(self.size, paths))
-        places = [path.rpartition("/") for path in paths]
-        held = {folder: self._sizes_in(folder) for folder in {folder for folder, _, _ in places}}
-        return [held[folder].get(name) for folder, _, name in places]
-
-    def _sizes_in(self, folder: str) -> dict[str, int]:
-        with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(self.path(folder)) as entries:
-            return {one.name: one.stat().st_size for one in entries}
-        return {}
 
     def files(self, relative: str, suffix: str = "") -> list[str]:
         """Return the files below a folder, relative to the root, sorted."""

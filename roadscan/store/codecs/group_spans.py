@@ -21,7 +21,7 @@ Int64 = npt.NDArray[np.int64]
 
 
 class GroupSpans(Sequence[tuple[int, int]]):
-    """Pairs of first and last epoch (GPS ns), held deflated, in four bytes or less; equal to a tuple of the same pairs."""
+    """Pairs of first and last epoch (GPS ns), held deflated in four bytes each; equal to a tuple of the same pairs."""
 
     __slots__ = ("_packed", "_size", "span")
 

@@ -133,7 +133,7 @@ def _tasks(session: Session) -> Iterator[StripTask]:
             slices = [near for one in own if (near := _within(one, files[one.file], pad))]
             slices += _others(session, way, runs[place + 1 :])
             seen = [[s.source.key, *road_key(s.source), files[s.file].digest, list(s.groups)] for s in slices]
-            rows = tuple(sum(files[s.file].group_rows[g] for g in s.groups) for s in slices)
+            rows = tuple(int(np.array(files[s.file].group_rows)[list(s.groups)].sum()) for s in slices)
             key = key_of(code, plan.ground.max_gap_s, sigma_m, first, last, seen)
             yield StripTask(plan.store, plan.ground, run, number, poses, sigma_m, first, last, tuple(slices), rows, key)
 
@@ -194,7 +194,7 @@ def _others(session: Session, way: Way, runs: Sequence[str]) -> list[RawSlice]:
     tiles, size_m = tiles_of(session), session.survey.config.tiles.size_m
     corners = np.floor(np.stack([way.easting_m, way.northing_m], axis=-1) / size_m).astype(np.int64)
     around = {TileId(c + i, r + k) for c, r in np.unique(corners, axis=0).tolist() for i in _BESIDE for k in _BESIDE}
-    runs_of_groups = tiles.groups.runs(tiles.numbers(tile for tile in around if tile in tiles))
+    runs_of_groups = tiles.groups.runs(tiles.held(around))
     cuts = np.flatnonzero(np.diff(runs_of_groups.slice, prepend=-1)).tolist()
     found: list[RawSlice] = []
     for start, end in itertools.pairwise([*cuts, runs_of_groups.slice.size]):

@@ -179,11 +179,14 @@ def _planned(
     own_key = product_key(product, options, context)
     bridged = {TileId.parse(r.unit) for r in files} - found.summaries.keys()  # tiles with a surface and no reading
     known = [*sorted(found.summaries), *sorted(bridged)]
-    for output in product.outputs(known, options, context) if found.summaries else []:
+    outputs = product.outputs(known, options, context) if found.summaries else []
+    drawn = {id(one.tiles): one.tiles for one in outputs}  # views of one sheet share them
+    told = {at: [held for tile in tiles if (held := found.contents.get(tile))] for at, tiles in drawn.items()}
+    for output in outputs:
         read = _read(product, files, output)
         parts = [(r.unit, r.digest, r.detail) for r in read]
-        tiles = [found.contents[tile] for tile in output.tiles if tile in found.contents]
-        yield PlannedOutput(product, options, output, key_of(own_key, output.name, tiles, parts, *driven), read)
+        key = key_of(own_key, output.name, told[id(output.tiles)], parts, *driven)
+        yield PlannedOutput(product, options, output, key, read)
 
 
 def _tasks(due: Sequence[PlannedOutput], plan: SurveyPlan, manifest: Manifest) -> list[OutputTask]:

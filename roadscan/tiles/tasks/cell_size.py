@@ -8,7 +8,7 @@ counted and not modelled; no reading is read again.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -23,7 +23,7 @@ from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.tasks.cell_files import read_cells
-from roadscan.tiles.tasks.tile_figures import tile_figures
+from roadscan.tiles.tasks.tile_figures import Summaries, tile_figures
 from roadscan.tiles.tasks.tile_plan import TILE
 
 _SAMPLED: Final = 4
@@ -75,7 +75,7 @@ def _readings(number: float) -> str:
 def _density(grid: TileGrid, store: Store, manifest: Manifest) -> CellDensity | None:
     """Return the density of the fullest tiles; None where there are none, or cells have plenty."""
     summaries = tile_figures(manifest).summaries
-    chosen = [summaries[tile] for tile in _fullest(summaries.points, summaries)]
+    chosen = [summaries[tile] for tile in _fullest(summaries)]
     if not chosen or sum(one.points for one in chosen) >= _PLENTY * sum(one.cells for one in chosen):
         return None
     records = {record.unit: record for record in manifest.chosen(TILE, [str(one.tile) for one in chosen])}
@@ -83,15 +83,16 @@ def _density(grid: TileGrid, store: Store, manifest: Manifest) -> CellDensity | 
     return cell_density(tiles, grid)
 
 
-def _fullest(points: Iterable[int], tiles: Iterable[TileId]) -> list[TileId]:
-    """Return some of the tiles with so many readings that together have half of all, from the fullest on."""
-    ordered = sorted(zip(points, tiles, strict=True), key=lambda one: (-one[0], str(one[1])))
-    if not ordered:
+def _fullest(summaries: Summaries) -> list[TileId]:
+    """Return some of the tiles that together have half of all readings, from the fullest to the least full."""
+    points = np.array(summaries.points)
+    if not points.size:
         return []
-    held = np.cumsum([count for count, _ in ordered])
-    half = ordered[: int(np.searchsorted(held, held[-1] / 2)) + 1]
-    numbers = np.unique(np.linspace(0, len(half) - 1, _SAMPLED).round().astype(int))
-    return [half[k][1] for k in numbers.tolist()]
+    order = np.argsort(-points, kind="stable")
+    held = np.cumsum(points[order])
+    half = order[: int(np.searchsorted(held, held[-1] / 2)) + 1]
+    tiles = list(summaries)
+    return [tiles[k] for k in half[np.unique(np.linspace(0, half.size - 1, _SAMPLED).round().astype(int))].tolist()]
 
 
 def cell_density(tiles: Sequence[TileCells], grid: TileGrid) -> CellDensity:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from array import array
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -27,7 +28,7 @@ class Summaries(Mapping[TileId, TileSummary]):
     def __init__(self, details: pa.ChunkedArray) -> None:
         self._details = details
         self._rows: dict[TileId, int] = {}
-        self.points: list[int] = []
+        self.points = array("q")
         """Readings of each tile."""
 
     def add(self, tile: TileId, row: int, points: int) -> None:

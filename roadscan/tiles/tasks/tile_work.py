@@ -43,7 +43,7 @@ def plan_tile_work(session: Session) -> TileWork:
         chosen = chosen_tiles(session.selection, tiles, footprints, plan.ground.grid)
     per_tile = tile_file_names()
     dropped = per_tile - tile_file_names({w.product.name for w in wanted})
-    gone = manifest.beside({TILE, OVERVIEWS, *per_tile} - dropped, {str(t) for t in tiles})
+    gone = manifest.beside({TILE, OVERVIEWS, *per_tile} - dropped, tiles.units)
     gone += manifest.beside(dropped, ())
     return TileWork(TilePlan(plan, footprints, tiles, wanted, context), chosen, gone, why)
 

@@ -147,12 +147,14 @@ class Manifest:
         own = self.own(product)
         at = pc.index_in(pa.array(units, pa.string()), own.column("unit"))
         known = own.select(["key", "path", "bytes"]).take(at)
-        same = pc.fill_null(pc.equal(known.column("key"), pa.array(keys, pa.string())), False)
-        paths = [path or "" for path in known.column("path").to_pylist()]
-        held = pa.array([self._store.size(path) if path else None for path in paths], pa.int64())
-        whole = pc.or_kleene(pc.equal(pa.array(paths), ""), pc.fill_null(pc.equal(held, known.column("bytes")), False))
-        odd = np.flatnonzero(~(same.to_numpy() & pc.fill_null(whole, False).to_numpy()))
-        stored, is_same = known.column("key").take(pa.array(odd)).to_pylist(), same.to_numpy()[odd].tolist()
+        same = pc.fill_null(pc.equal(known.column("key"), pa.array(keys, pa.string())), False).to_numpy()
+        batches = (batch.column(0).to_pylist() for batch in known.select(["path"]).to_batches(_BATCH_ROWS))
+        sizes = self._store.sizes(path or "" for paths in batches for path in paths)
+        held = np.fromiter((-1 if size is None else size for size in sizes), np.int64, known.num_rows)
+        whole = pc.fill_null(pc.equal(known.column("path"), ""), False).to_numpy()
+        whole = whole | (held == pc.fill_null(known.column("bytes"), -1).to_numpy())
+        odd = np.flatnonzero(~(same & whole))
+        stored, is_same = known.column("key").take(pa.array(odd)).to_pylist(), same[odd].tolist()
         return {
             units[place]: MISSING if key is None else DAMAGED if fits or key == _DAMAGED else CHANGED
             for place, key, fits in zip(odd.tolist(), stored, is_same, strict=True)

@@ -116,18 +116,21 @@ class Store:
 
     def size(self, relative: str) -> int | None:
         """Return the bytes of a file, None where it is missing."""
-        path = f"{self.root}/{relative}"
+        if self.is_folder:
+            return _bytes_of(self.path(relative))
+        if (look := self._look()) is not None:
+            with self._reached():
+                size = look.size(relative)
+            if size is not None or look.is_whole:
+                return size
         try:
-            if self.is_folder:
-                return os.stat(path).st_size  # noqa: PTH116 — of 400,000 files; a third of the time of others' ways
-            if (look := self._look()) is not None:
-                with self._reached():
-                    size = look.size(relative)
-                if size is not None or look.is_whole:
-                    return size
-            return int(self.fs.size(path))
-        except (FileNotFoundError, NotADirectoryError):
+            return int(self.fs.size(self.path(relative)))
+        except FileNotFoundError:
             return None
+
+    def sizes(self, paths: Iterable[str]) -> Iterator[int | None]:
+        """Yield the same of many files."""
+        return (_bytes_of(f"{self.root}/{path}") for path in paths) if self.is_folder else map(self.size, paths)
 
     def files(self, relative: str, suffix: str = "") -> list[str]:
         """Return the files below a folder, relative to the root, sorted."""
@@ -445,6 +448,14 @@ class Store:
                 continue
             shutil.rmtree(left, ignore_errors=True)
             left.unlink(missing_ok=True) if left.is_file() else None
+
+
+def _bytes_of(file: str) -> int | None:
+    """Return the bytes of a file, None where it is missing; a survey has 400,000, and `pathlib` takes twice the time."""
+    try:
+        return os.stat(file).st_size  # noqa: PTH116
+    except (FileNotFoundError, NotADirectoryError):
+        return None
 
 
 def _is_stray(left: Path) -> bool:

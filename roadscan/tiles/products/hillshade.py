@@ -230,7 +230,7 @@ def with_neighbours(sheet: Sheet, everything: frozenset[TileId]) -> tuple[TileId
     columns, rows = ({of(t[k] for t in sheet.tiles) for of in (min, max)} for k in (0, 1))
     rim = [t for t in sheet.tiles if t.column in columns or t.row in rows]
     around = {TileId(t.column + right, t.row + up) for t in rim for right in (-1, 0, 1) for up in (-1, 0, 1)}
-    return tuple(sorted({*sheet.tiles, *(around & everything)}))
+    return tuple(sorted([*sheet.tiles, *(around & everything).difference(sheet.tiles)]))
 
 
 def base_below(tiles: Sequence[TileSummary], output: Output) -> float:

@@ -78,7 +78,7 @@ class Kilometre(SurveyProduct):
         """Sheets of each view and pixel, followed by the index that joins them."""
         settings = cast(KilometreOptions, options)
         everything = frozenset(tiles)
-        sheets = cut_sheets("", everything, settings.sheet_m, context.grid)  # the same for all, as names without stem
+        sheets = cut_sheets("", tiles, settings.sheet_m, context.grid)  # the same for all, as names without stem
         index = index_output("", sheets)
         plain = [Output(s.name, s.tiles) for s in sheets] + index
         wanted = sheets if "shaded" in settings.views else ()

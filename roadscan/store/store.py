@@ -451,7 +451,7 @@ class Store:
 
 
 def _bytes_of(file: str) -> int | None:
-    """Return the bytes of a file, None where it is missing; a survey has 400,000, and `pathlib` takes twice the time."""
+    """Return the bytes of a file, None where it is missing; of 400,000, `pathlib` takes twice the time."""
     try:
         return os.stat(file).st_size  # noqa: PTH116
     except (FileNotFoundError, NotADirectoryError):

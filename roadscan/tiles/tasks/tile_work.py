@@ -8,10 +8,9 @@ from dataclasses import dataclass, field
 from roadscan.core.ids import TileId
 from roadscan.footprints.footprints import footprints_of
 from roadscan.georeference.plan.plan import plan_of
-from roadscan.run.memory import BYTES_PER_READING, WORKER_BASE_BYTES
+from roadscan.run.memory import BYTES_PER_READING, MOST_CELL_BYTES, WORKER_BASE_BYTES
 from roadscan.run.session import Session
 from roadscan.store.manifest import OutputRecord
-from roadscan.tiles.accumulator import MOST_BYTES
 from roadscan.tiles.tasks.selection import chosen_tiles
 from roadscan.tiles.tasks.tile_files import tile_file_names
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, TilePlan, TileTask, stale_tiles, tiles_of
@@ -50,5 +49,5 @@ def plan_tile_work(session: Session) -> TileWork:
 
 def memory_of(tasks: Sequence[TileTask]) -> int:
     """Return the approximate memory (bytes) that a worker needs for the largest of some tasks."""
-    largest = max((t.readings * BYTES_PER_READING if t.needs_points else MOST_BYTES for t in tasks), default=0)
+    largest = max((t.readings * BYTES_PER_READING if t.needs_points else MOST_CELL_BYTES for t in tasks), default=0)
     return WORKER_BASE_BYTES + largest if tasks else 0

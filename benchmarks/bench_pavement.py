@@ -79,7 +79,11 @@ def _pictures(cells: TileCells, folder: Path) -> Iterator[Figure]:
 def _sheets(folder: Path) -> Iterator[Figure]:
     road = _Road()
     product, options = Kilometre(), KilometreOptions()
-    outputs = [o for o in product.outputs(road.summaries, options, CONTEXT) if o.name.endswith("553_6020.tif")]
+    outputs = [
+        o
+        for o in product.outputs([s.tile for s in road.summaries], options, CONTEXT)
+        if o.name.endswith("553_6020.tif")
+    ]
     total = 0.0
     for output in outputs:
         path = folder / output.name

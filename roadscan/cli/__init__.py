@@ -34,7 +34,7 @@ from roadscan.cli import (
 from roadscan.cli.added_stages import Commands
 from roadscan.cli.ending import ending_well
 
-_OBJECTS: Final = 300_000
+_OBJECTS: Final = 600_000
 """New objects after which Python looks for garbage: modules make many and none of it, and looking took a fifth of a
 start, and a third of a short command at its end, where all is looked through once more."""
 

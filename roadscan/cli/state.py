@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -157,6 +158,7 @@ def _some(names: Sequence[str], count: int) -> str:
 
 def found_status(survey_file: Path) -> Status:
     """The state of a survey's store."""
+    os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")  # Arrow's own keeps a third more; not loaded by now
     from roadscan.run.session import Session
     from roadscan.survey.status import survey_status
 

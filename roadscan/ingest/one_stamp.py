@@ -14,7 +14,7 @@ from roadscan.core.witness import Finding, Witness
 from roadscan.ingest.log_check import LogCheck, Refused, epochs_in
 from roadscan.ingest.overlap import Fault
 from roadscan.ingest.reading.format import Rows
-from roadscan.store.logs import LogRecord
+from roadscan.store.logs import DataFile, LogRecord
 
 STAMPED: Final = ("scans", "imu", "encoder", "gnss")
 """Tables in which each row has a time. Returns of one sweep may share theirs."""
@@ -81,18 +81,18 @@ def one_stamp_findings(records: Sequence[LogRecord]) -> list[Finding]:
 
 def _stands(record: LogRecord, table: str) -> bool:
     """Return whether the clock stood for most left-out rows, or (in a first look) for all remaining ones."""
-    return record.reject_reasons.get(STANDS, 0) > record.rows or _share(record, table) == 1.0
+    return record.reject_reasons.get(STANDS, 0) > record.rows or _all_stand(record.tables.get(table, ()))
 
 
-def _share(record: LogRecord, table: str) -> float:
-    """Return the share of a table's rows in row groups with one stamp; single rows are ignored."""
-    total = standing = 0
-    for file in record.tables.get(table, ()):
-        rows, (first, last) = np.array(file.group_rows, np.int64), np.array(file.group_spans, np.int64).T
-        several = rows > 1
-        total += int(rows[several].sum())
-        standing += int(rows[several & (first == last)].sum())
-    return standing / total if total else 0.0
+def _all_stand(files: Sequence[DataFile]) -> bool:
+    """Return whether each row group of several rows has one stamp, and there is one; single rows are ignored."""
+    groups = 0
+    for file in files:
+        several, (first, last) = np.array(file.group_rows) > 1, np.array(file.group_spans).T
+        if (first != last)[several].any():
+            return False
+        groups += int(several.sum())
+    return groups > 0
 
 
 def _fault(record: LogRecord, table: str) -> Fault:

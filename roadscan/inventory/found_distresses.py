@@ -30,8 +30,8 @@ from roadscan.tiles.mosaics.products import StoredTiles
 from roadscan.tiles.product import ProductContext, TileSummary
 from roadscan.tiles.products.geo_table import in_crs_unit, read_geo_table
 from roadscan.tiles.pyramid import Level, overview_factors
+from roadscan.tiles.tasks.tile_figures import summary_of
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE
-from roadscan.tiles.tasks.tiles import summary_of
 from roadscan.tiles.tasks.wanted_products import product_context
 
 _PIXEL_M: Final = 0.04

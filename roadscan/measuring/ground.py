@@ -18,8 +18,8 @@ from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.store import Store
 from roadscan.tiles.pyramid import overview_factors
 from roadscan.tiles.tasks.cell_files import read_cells, read_overview
+from roadscan.tiles.tasks.tile_figures import summary_of
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE
-from roadscan.tiles.tasks.tiles import summary_of
 
 Float64 = npt.NDArray[np.float64]
 Bool = npt.NDArray[np.bool_]

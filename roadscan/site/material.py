@@ -28,8 +28,8 @@ from roadscan.store.store import Store
 from roadscan.tiles.mosaics.products import StoredTiles
 from roadscan.tiles.product import ProductContext, TileSummary
 from roadscan.tiles.products.geo_table import read_geo_table
+from roadscan.tiles.tasks.tile_figures import summary_of
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE
-from roadscan.tiles.tasks.tiles import summary_of
 from roadscan.tiles.tasks.wanted_products import product_context
 
 SHEET_M: Final = 1000.0

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 from weakref import WeakValueDictionary
-
-import numpy as np
 
 from roadscan.core.errors import DamagedError, StoreError
 from roadscan.core.witness import Finding
 from roadscan.store.checked_json import checked_json, parse_checked
-from roadscan.store.codecs.group_spans import GroupSpans
+from roadscan.store.codecs.group_spans import GroupRows, GroupSpans
 from roadscan.store.digest import bytes_digest
 from roadscan.store.store import Store
 
@@ -40,25 +36,25 @@ class DataFile:
     bytes: int
     digest: str
     """BLAKE3-128 of its bytes with the prefix ``blake3:``; without a prefix, BLAKE2b-128 (older versions)."""
-    group_rows: tuple[int, ...]
-    """Rows of each row group."""
+    group_rows: Sequence[int]
+    """Rows of each row group, held as :class:`GroupRows`."""
     group_spans: Sequence[tuple[int, int]]
     """First and last epoch (GPS ns) of each row group, held as :class:`GroupSpans`; empty for tables without epochs."""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.group_spans, GroupSpans):
-            object.__setattr__(self, "group_spans", GroupSpans(self.group_spans))
+        for name, kind in (("group_rows", GroupRows), ("group_spans", GroupSpans)):
+            if not isinstance(given := getattr(self, name), kind):
+                object.__setattr__(self, name, kind(given))
 
-    @cached_property
+    @property
     def span(self) -> tuple[int, int] | None:
         """First and last epoch (GPS ns)."""
-        first, last = np.array(self.group_spans).T
-        return (int(first.min()), int(last.max())) if first.size else None
+        return cast("GroupSpans", self.group_spans).span
 
     def as_json(self) -> dict[str, Any]:
         """Return its entry in a record: equal rows of neighbouring groups as [groups, rows], spans as a text."""
-        runs = [[len(list(own)), rows] for rows, own in itertools.groupby(self.group_rows)]
-        packed = {"group_rows": runs, "group_spans": GroupSpans(self.group_spans).text()}
+        rows, spans = cast("GroupRows", self.group_rows), cast("GroupSpans", self.group_spans)
+        packed = {"group_rows": list(map(list, rows.runs)), "group_spans": spans.text()}
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)} | packed
 
 
@@ -194,9 +190,8 @@ def data_file(raw: Mapping[str, Any]) -> DataFile:
     """Return a data file from its entry in a record; older versions wrote each row group by itself."""
     rows, spans = raw["group_rows"], raw["group_spans"]
     if isinstance(spans, str):
-        rows = itertools.chain.from_iterable(itertools.repeat(n, groups) for groups, n in rows)
-    held = GroupSpans.of_text(spans) if isinstance(spans, str) else GroupSpans(spans)
-    return DataFile(**{**raw, "group_rows": tuple(rows), "group_spans": held})
+        rows, spans = GroupRows.of_runs(rows), GroupSpans.of_text(spans)
+    return DataFile(**{**raw, "group_rows": rows, "group_spans": spans})
 
 
 def parse_log_record(content: bytes, key: str, path: str) -> LogRecord:

@@ -102,13 +102,13 @@ class Manifest:
 
     def chosen(self, product: str, units: Collection[str]) -> list[OutputRecord]:
         """Return the records of some units of a product, without those that have none."""
-        table = self._own(product)
+        table = self.own(product)
         named = pc.is_in(table.column("unit"), pa.array(list(units), pa.string()))
         return list(map(OutputRecord._make, rows_of(table.filter(named))))
 
     def column(self, product: str, *names: str) -> Iterator[tuple[Any, ...]]:
         """Yield some values of each record of a product, by unit; few of them are Python objects at a time."""
-        for batch in self._own(product).select(names).to_batches(max_chunksize=_BATCH_ROWS):
+        for batch in self.own(product).select(names).to_batches(max_chunksize=_BATCH_ROWS):
             yield from zip(*(column.to_pylist() for column in batch.columns), strict=True)
 
     def found(self, make: Callable[[Manifest], T]) -> T:
@@ -144,16 +144,17 @@ class Manifest:
 
     def reasons(self, product: str, units: Sequence[str], keys: Sequence[str]) -> dict[str, str]:
         """Return why outputs are due (:meth:`why_due`), by unit, without those that are current: of many at once."""
-        own = self._own(product)
+        own = self.own(product)
         at = pc.index_in(pa.array(units, pa.string()), own.column("unit"))
         known = own.select(["key", "path", "bytes"]).take(at)
-        same = pc.fill_null(pc.equal(known.column("key"), pa.array(keys, pa.string())), False)
-        paths = [path or "" for path in known.column("path").to_pylist()]
-        sizes = iter(self._store.sizes([path for path in paths if path]))
-        held = pa.array([next(sizes) if path else None for path in paths], pa.int64())
-        whole = pc.or_kleene(pc.equal(pa.array(paths), ""), pc.fill_null(pc.equal(held, known.column("bytes")), False))
-        odd = np.flatnonzero(~(same.to_numpy() & pc.fill_null(whole, False).to_numpy()))
-        stored, is_same = known.column("key").take(pa.array(odd)).to_pylist(), same.to_numpy()[odd].tolist()
+        same = pc.fill_null(pc.equal(known.column("key"), pa.array(keys, pa.string())), False).to_numpy()
+        batches = (batch.column(0).to_pylist() for batch in known.select(["path"]).to_batches(_BATCH_ROWS))
+        sizes = self._store.sizes(path or "" for paths in batches for path in paths)
+        held = np.fromiter((-1 if size is None else size for size in sizes), np.int64, known.num_rows)
+        whole = pc.fill_null(pc.equal(known.column("path"), ""), False).to_numpy()
+        whole = whole | (held == pc.fill_null(known.column("bytes"), -1).to_numpy())
+        odd = np.flatnonzero(~(same & whole))
+        stored, is_same = known.column("key").take(pa.array(odd)).to_pylist(), same[odd].tolist()
         return {
             units[place]: MISSING if key is None else DAMAGED if fits or key == _DAMAGED else CHANGED
             for place, key, fits in zip(odd.tolist(), stored, is_same, strict=True)
@@ -231,10 +232,10 @@ class Manifest:
         """Return the rows of a product by unit."""
         rows = self._rows.get(product)
         if rows is None:
-            rows = self._rows[product] = {row[1]: row for row in rows_of(self._own(product))}
+            rows = self._rows[product] = {row[1]: row for row in rows_of(self.own(product))}
         return rows
 
-    def _own(self, product: str) -> pa.Table:
+    def own(self, product: str) -> pa.Table:
         """Return the records of a product, which stand together."""
         table = self.table()
         if not self._places:

@@ -57,8 +57,6 @@ _MAKE_ROOM: Final = (
 
 _AT_ONCE_BYTES: Final = 16 << 20
 """Largest object (bytes) that is copied by one request and through memory."""
-_MANY_FILES: Final = 64
-"""Files whose folders are listed, where fewer are asked for one by one: a folder may hold many others."""
 
 MADE_AGAIN: Final = "run `roadscan verify`, which finds all such files; the next run then makes them again"
 """How a damaged product is repaired."""
@@ -118,6 +116,8 @@ class Store:
 
     def size(self, relative: str) -> int | None:
         """Return the bytes of a file, None where it is missing."""
+        if self.is_folder:
+            return _bytes_of(self.path(relative))
         if (look := self._look()) is not None:
             with self._reached():
                 size = look.size(relative)
@@ -128,18 +128,9 @@ class Store:
         except FileNotFoundError:
             return None
 
-    def sizes(self, paths: Sequence[str]) -> list[int | None]:
-        """Return the bytes of some files, None for each that is missing; folders with many of them are listed once."""
-        if not self.is_folder or len(paths) < _MANY_FILES:
-            return list(map(self.size, paths))
-        places = [path.rpartition("/") for path in paths]
-        held = {folder: self._sizes_in(folder) for folder in {folder for folder, _, _ in places}}
-        return [held[folder].get(name) for folder, _, name in places]
-
-    def _sizes_in(self, folder: str) -> dict[str, int]:
-        with contextlib.suppress(FileNotFoundError, NotADirectoryError), os.scandir(self.path(folder)) as entries:
-            return {one.name: one.stat().st_size for one in entries}
-        return {}
+    def sizes(self, paths: Iterable[str]) -> Iterator[int | None]:
+        """Yield the same of many files."""
+        return (_bytes_of(f"{self.root}/{path}") for path in paths) if self.is_folder else map(self.size, paths)
 
     def files(self, relative: str, suffix: str = "") -> list[str]:
         """Return the files below a folder, relative to the root, sorted."""
@@ -457,6 +448,14 @@ class Store:
                 continue
             shutil.rmtree(left, ignore_errors=True)
             left.unlink(missing_ok=True) if left.is_file() else None
+
+
+def _bytes_of(file: str) -> int | None:
+    """Return the bytes of a file, None where it is missing; of 400,000, `pathlib` takes twice the time."""
+    try:
+        return os.stat(file).st_size  # noqa: PTH116
+    except (FileNotFoundError, NotADirectoryError):
+        return None
 
 
 def _is_stray(left: Path) -> bool:

@@ -285,6 +285,6 @@ def describe(path: Path, relative: str) -> DataFile:
         rows=metadata.num_rows,
         bytes=path.stat().st_size,
         digest=file_digest(path),
-        group_rows=tuple(g.num_rows for g in groups),
-        group_spans=tuple(spans),
+        group_rows=[g.num_rows for g in groups],
+        group_spans=spans,
     )

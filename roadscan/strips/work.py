@@ -133,7 +133,7 @@ def _tasks(session: Session) -> Iterator[StripTask]:
             slices = [near for one in own if (near := _within(one, files[one.file], pad))]
             slices += _others(session, way, runs[place + 1 :])
             seen = [[s.source.key, *road_key(s.source), files[s.file].digest, list(s.groups)] for s in slices]
-            rows = tuple(sum(files[s.file].group_rows[g] for g in s.groups) for s in slices)
+            rows = tuple(int(np.array(files[s.file].group_rows)[list(s.groups)].sum()) for s in slices)
             key = key_of(code, plan.ground.max_gap_s, sigma_m, first, last, seen)
             yield StripTask(plan.store, plan.ground, run, number, poses, sigma_m, first, last, tuple(slices), rows, key)
 
@@ -161,23 +161,21 @@ def _stretches(own: Sequence[RawSlice]) -> list[tuple[int, int]]:
     return [(int(begin), int(begin) + length) for begin in begins]
 
 
-def _knots(recorded: Trajectory, span: tuple[int, int]) -> Int64:
-    """Returns the epochs (n,) of the recorded poses of a time span."""
-    epochs = recorded.epochs_gps_ns
-    return np.asarray(epochs[(epochs >= span[0]) & (epochs <= span[1])])
-
-
 def _way(recorded: Trajectory, ground: MapSettings, span: tuple[int, int]) -> Way | None:
-    """Returns the way within a time span, or its beginning; None where the vehicle stands or there are no poses."""
-    knots = _knots(recorded, span)
-    thin = knots[np.unique(knots // _STEP_NS, return_index=True)[1]]
+    """Returns the way within a time span, or its beginning; None where the vehicle stands or there are no poses.
+
+    It goes through recorded poses, so that `status`, which asks for it, loads no kernel.
+    """
+    epochs, apart = recorded.epochs_gps_ns, np.diff(recorded.epochs_gps_ns) > ground.max_gap_s * NS_PER_S
+    knots = np.flatnonzero((epochs >= span[0]) & (epochs <= span[1]))
+    thin = knots[np.unique(epochs[knots] // _STEP_NS, return_index=True)[1]]
     if thin.size < 2:
         return None
-    poses_at = level_poses(recorded, ground.map, thin)
-    body = poses_at.body_m
+    thin = thin[~np.append(apart, apart[-1])[thin]]
+    body = ground.map.map_from_world(recorded.world, recorded.position_world_m[thin])
     station = way_along(body)
     kept = station <= _LENGTH_M
-    return Way.of(body[kept], poses_at.epoch_gps_ns[kept]) if min(station[-1], _LENGTH_M) >= _LEAST_LENGTH_M else None
+    return Way.of(body[kept], epochs[thin][kept]) if min(station[-1], _LENGTH_M) >= _LEAST_LENGTH_M else None
 
 
 def _within(one: RawSlice, file: DataFile, span: tuple[int, int]) -> RawSlice | None:
@@ -196,7 +194,7 @@ def _others(session: Session, way: Way, runs: Sequence[str]) -> list[RawSlice]:
     tiles, size_m = tiles_of(session), session.survey.config.tiles.size_m
     corners = np.floor(np.stack([way.easting_m, way.northing_m], axis=-1) / size_m).astype(np.int64)
     around = {TileId(c + i, r + k) for c, r in np.unique(corners, axis=0).tolist() for i in _BESIDE for k in _BESIDE}
-    runs_of_groups = tiles.groups.runs(tiles.numbers(tile for tile in around if tile in tiles))
+    runs_of_groups = tiles.groups.runs(tiles.held(around))
     cuts = np.flatnonzero(np.diff(runs_of_groups.slice, prepend=-1)).tolist()
     found: list[RawSlice] = []
     for start, end in itertools.pairwise([*cuts, runs_of_groups.slice.size]):
@@ -263,7 +261,8 @@ def compare_strip(task: StripTask) -> OutputRecord:
     seen: list[tuple[SeenBy, Strip]] = []
     if way is not None:
         placer = Georeferencer(task.store, task.ground, task.slices, recorded=True)
-        sway = Sway.of(level_poses(recorded, task.ground.map, _knots(recorded, pad)))
+        epochs = recorded.epochs_gps_ns
+        sway = Sway.of(level_poses(recorded, task.ground.map, epochs[(epochs >= pad[0]) & (epochs <= pad[1])]))
         order = sorted(task.slices, key=lambda one: (one.source.run != task.run, one.source.run, one.source.sensor))
         for _, slices in itertools.groupby(order, lambda one: (one.source.run, one.source.sensor)):
             seen.append(_seen_by(task, placer, way, sway, list(slices)))

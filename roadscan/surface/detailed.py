@@ -9,17 +9,20 @@ within that distance of a node give it the same height, to the bit, whatever els
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
 from roadscan.core.strict import Strict
-from roadscan.surface.clough_tocher import CubicSurface, cubic_surface
-from roadscan.surface.normals import RINGS, slopes_at
 from roadscan.surface.settings import SlopeKind
 from roadscan.surface.sites import sites
 from roadscan.surface.triangulation import triangulate
 from roadscan.surface.window import GridWindow
+
+if TYPE_CHECKING:
+    from roadscan.surface.clough_tocher import CubicSurface
 
 
 class DetailedSettings(Strict):
@@ -37,6 +40,8 @@ class DetailedSettings(Strict):
         A node's triangle and those beside it reach 2 gaps from it, the neighbours of their corners a gap a ring, and
         the circles that decide about the last ring are counted in that ring.
         """
+        from roadscan.surface.normals import RINGS
+
         return (2 + RINGS) * self.max_gap_m
 
 
@@ -51,6 +56,9 @@ def surface_through(points_m: npt.NDArray[np.float64], settings: DetailedSetting
     RoadscanError
         Where a coordinate is not finite.
     """
+    from roadscan.surface.clough_tocher import cubic_surface
+    from roadscan.surface.normals import slopes_at
+
     places = sites(points_m)
     mesh = triangulate(places, settings.max_gap_m)
     return cubic_surface(places, mesh, slopes_at(places, mesh, settings.slopes).slopes)

@@ -19,11 +19,9 @@ import numpy.typing as npt
 from roadscan.core.grid import QUANTUM_M, Bounds, TileGrid
 from roadscan.core.ids import TileId
 from roadscan.georeference.cloud import TilePoints
-from roadscan.surface.clough_tocher import cubic_surface
 from roadscan.surface.detailed import DetailedSettings
 from roadscan.surface.holes import RIM, Holes, cells_across
 from roadscan.surface.lowest import LowestReadings
-from roadscan.surface.normals import slopes_at
 from roadscan.surface.settings import SurfaceConfig
 from roadscan.surface.sites import sites
 from roadscan.surface.smoothing import halo_cells, smooth_surface
@@ -192,6 +190,9 @@ def _needed(wanted: Bool, beyond: int) -> slice:
 
 
 def _detailed(window: GridWindow, tiles: Iterable[TilePoints], grid: SurfaceGrid) -> Patch:
+    from roadscan.surface.clough_tocher import cubic_surface
+    from roadscan.surface.normals import slopes_at
+
     box, margin = window.bounds(), grid.detailed.halo_m + max(grid.cell_m)
     parts = [_near(one, grid.tiles, box, margin) for one in tiles]
     places = np.concatenate([p for p, _ in parts]) if parts else np.empty((0, 3))

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.core.errors import DamagedError, RoadscanError, StoreError
@@ -147,6 +148,7 @@ def _survey_status(session: Session) -> Status:
     status.readings = reading_counts(manifest).of_all()
     status.findings = findings_of(session.survey, [r for r in records.values() if r.key in keys], manifest)
     for stage in stages():
+        pa.default_memory_pool().release_unused()
         try:
             status.stages[stage.name] = state = stage.state(session)
         except NothingPlacedError as error:

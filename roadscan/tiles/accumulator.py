@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -14,7 +13,8 @@ from roadscan.core.errors import RoadscanError
 from roadscan.core.grid import QUANTUM_M, TileGrid
 from roadscan.core.ids import TileId
 from roadscan.georeference.kernels.readings import FATES
-from roadscan.tiles.cells import TileCells
+from roadscan.run.memory import MOST_CELL_BYTES
+from roadscan.tiles.cells import TileCells, TileEvidence
 from roadscan.tiles.kernels import cell_statistics as finishing
 from roadscan.tiles.kernels import pool as kernels
 from roadscan.tiles.kernels.accumulate import PIECE, CountingWork, Heights, accumulate_cells, work_arrays
@@ -28,9 +28,6 @@ from roadscan.tiles.row_buckets import RowBuckets
 ROBUST_FLOOR_QUANTA: Final = 100.0
 """Heights within 1 mm of the median always count."""
 
-MOST_BYTES: Final = 800 << 20
-"""Memory that the cells of active tiles may take."""
-
 _BUCKETS: Final = 1 / 3
 """Share of that memory that readings in buckets may take, which are not counted yet."""
 
@@ -40,17 +37,6 @@ _COLUMNS: Final = (
 )  # fmt: skip
 """Types of the columns of ``CellColumns`` except the last two."""
 _NEVER: Final = np.array([2**62, -(2**62)])  # First and last epoch (GPS ns) of a tile without readings.
-
-
-@dataclass(frozen=True)
-class TileEvidence:
-    """Epochs of a tile's readings, and σ of the poses that georeferenced them."""
-
-    first_epoch_gps_ns: int
-    last_epoch_gps_ns: int
-    sigma_horizontal_m: float
-    """Largest 1 σ of the poses; NaN where a trajectory does not state it."""
-    sigma_down_m: float
 
 
 class Pool:
@@ -139,7 +125,7 @@ class Accumulator:
         tiles: Sequence[TileId],
         passes: Sequence[int] | npt.NDArray[np.uint16],
         pool: Pool | None = None,
-        most_bytes: int = MOST_BYTES,
+        most_bytes: int = MOST_CELL_BYTES,
     ) -> None:
         """Create an accumulator without active tiles.
 

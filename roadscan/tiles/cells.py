@@ -48,3 +48,14 @@ class TileCells:
         image = np.full((self.cells_per_edge, self.cells_per_edge), np.nan, dtype=np.float32)
         image[self.cells_per_edge - 1 - self.row.astype(np.int64), self.column] = getattr(self, name)
         return image
+
+
+@dataclass(frozen=True)
+class TileEvidence:
+    """Epochs of a tile's readings, and σ of the poses that georeferenced them."""
+
+    first_epoch_gps_ns: int
+    last_epoch_gps_ns: int
+    sigma_horizontal_m: float
+    """Largest 1 σ of the poses; NaN where a trajectory does not state it."""
+    sigma_down_m: float

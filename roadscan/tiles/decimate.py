@@ -13,8 +13,6 @@ from roadscan.compute.kernel_options import read_only
 from roadscan.core.errors import ConfigError
 from roadscan.core.grid import TileGrid
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.kernels import decimate as kernels
-from roadscan.tiles.kernels.decimate_2x2 import decimate_2x2
 
 PATCH_M: Final = 0.1
 """A slope is computed from at least this length of road; from fewer cells, a few stones would make one."""
@@ -81,6 +79,9 @@ def decimate(cells: TileCells, side: int, cell_m: float) -> Squares:
     side : cells along an edge of a square, a divisor of the tile's.
     cell_m : edge of a cell (m).
     """
+    from roadscan.tiles.kernels import decimate as kernels
+    from roadscan.tiles.kernels.decimate_2x2 import decimate_2x2
+
     edge = cells.cells_per_edge
     patch = patch_cells(side, edge, cell_m)
     room = min(len(cells), (edge // side) ** 2)

@@ -237,8 +237,8 @@ class SurveyProduct(ABC):
         return
 
     @abstractmethod
-    def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
-        """Return the files to write; none may read another."""
+    def outputs(self, tiles: Sequence[TileId], options: Strict, context: ProductContext) -> list[Output]:
+        """Return the files to write of these tiles; none may read another."""
 
     @abstractmethod
     def write(

@@ -15,7 +15,6 @@ import numpy.typing as npt
 from roadscan.compute.kernel_options import read_only
 from roadscan.core.errors import ConfigError
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.kernels.decimate import Cells
 from roadscan.tiles.kernels.pyramid import Levels, Pixels, reduce_cells
 
 WANTED_FACTORS: Final = (2, 8, 32)
@@ -77,6 +76,8 @@ def pyramid_of(cells: TileCells, factors: Sequence[int]) -> list[Level]:
     rounded: exact up to 128 readings of 65,535 a cell). Raises :class:`ConfigError` for factors that do not
     divide the tile's edge or are not ascending multiples of one another.
     """
+    from roadscan.tiles.kernels.decimate import Cells
+
     edge = cells.cells_per_edge
     _check(edge, factors)
     if not factors:

@@ -85,7 +85,7 @@ def summaries(workshop, context, tiles):
 
 
 def joined(product, options, files, tiles, context, path):
-    (output,) = product.outputs(tiles, options, context)
+    (output,) = product.outputs([one.tile for one in tiles], options, context)
     product.write(output, tiles, files, options, context, path)
     product.check(path)
     return geopandas.read_parquet(path)

@@ -12,9 +12,8 @@ from roadscan.georeference.reading_counts import LogCounts
 from roadscan.run.engine.fingerprint import key_of, keys_beside
 from roadscan.store.manifest import CHANGED, DAMAGED, MISSING, Manifest, OutputRecord
 from roadscan.store.store import Store
-from roadscan.tiles.tasks.tile_figures import tile_figures
+from roadscan.tiles.tasks.tile_figures import summary_of, tile_figures
 from roadscan.tiles.tasks.tile_plan import TILE
-from roadscan.tiles.tasks.tiles import summary_of
 
 TILES = 300
 

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Final, cast
 import numpy as np
 import pyarrow as pa
 
+from roadscan.core.ids import TileId
 from roadscan.core.strict import Strict
 from roadscan.distress.crack_network import Crack, join_cracks
 from roadscan.distress.cracks import CrackPiece
@@ -54,9 +55,9 @@ class Cracks(SurveyProduct):
     reads: ClassVar[tuple[str, ...]] = ("crack_pieces",)
     needs_lanes: ClassVar[bool] = True
 
-    def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
+    def outputs(self, tiles: Sequence[TileId], options: Strict, context: ProductContext) -> list[Output]:
         """Returns one file."""
-        return [Output("cracks.parquet", tuple(sorted(t.tile for t in tiles)))]
+        return [Output("cracks.parquet", tuple(sorted(tiles)))]
 
     def write(
         self,

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Final, cast
 import numpy as np
 import pyarrow as pa
 
+from roadscan.core.ids import TileId
 from roadscan.core.strict import Strict
 from roadscan.distress.potholes import Pothole, PotholePiece, join_potholes
 from roadscan.distress.products.pothole_pieces import read_pieces
@@ -42,9 +43,9 @@ class Potholes(SurveyProduct):
     default: ClassVar[bool] = False
     reads: ClassVar[tuple[str, ...]] = ("pothole_pieces",)
 
-    def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
+    def outputs(self, tiles: Sequence[TileId], options: Strict, context: ProductContext) -> list[Output]:
         """Returns one file."""
-        return [Output("potholes.parquet", tuple(sorted(t.tile for t in tiles)))]
+        return [Output("potholes.parquet", tuple(sorted(tiles)))]
 
     def write(
         self,

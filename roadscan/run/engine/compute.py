@@ -92,7 +92,7 @@ def rare_collections() -> Iterator[None]:
     A run keeps hundreds of thousands of records and makes no cycles: looking for them takes a third of its time.
     """
     before = gc.get_threshold()
-    gc.set_threshold(_OBJECTS, before[1], before[2])
+    gc.set_threshold(max(_OBJECTS, before[0]), before[1], before[2])
     try:
         yield
     finally:

@@ -60,10 +60,10 @@ class SurfaceHillshade(SurveyProduct):
         """Raise where the files of `surface` have no heights."""
         need_bands(self.name, ("height",), read)
 
-    def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
+    def outputs(self, tiles: Sequence[TileId], options: Strict, context: ProductContext) -> list[Output]:
         """Returns sheets, the index that joins them, and the picture."""
         edge_m = sheet_edge_m(cast(HillshadeOptions, options).sheet_m, context)
-        everything = tuple(sorted(t.tile for t in tiles))
+        everything = tuple(sorted(tiles))
         sheets = cut_sheets(_STEM, everything, edge_m, context.grid)
         known = frozenset(everything)
         found = [Output(sheet.name, with_neighbours(sheet, known)) for sheet in sheets]

@@ -10,6 +10,7 @@ from typing import ClassVar, cast
 import numpy as np
 from pydantic import Field
 
+from roadscan.core.ids import TileId
 from roadscan.core.strict import Strict
 from roadscan.store.codecs.cog import Pixels, write_sparse_cog
 from roadscan.store.codecs.tiff import check_cog
@@ -58,13 +59,13 @@ class SurfaceMosaic(SurveyProduct):
         """Raise where the files of `surface` lack a band."""
         need_bands(self.name, cast(SurfaceMosaicOptions, options).bands, read)
 
-    def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
+    def outputs(self, tiles: Sequence[TileId], options: Strict, context: ProductContext) -> list[Output]:
         """Returns the sheets of each band, followed by the index that joins them."""
         settings = cast(SurfaceMosaicOptions, options)
         edge_m = sheet_edge_m(settings.sheet_m, context)
         found: list[Output] = []
         for band in settings.bands:
-            sheets = cut_sheets(band, (t.tile for t in tiles), edge_m, context.grid)
+            sheets = cut_sheets(band, tiles, edge_m, context.grid)
             found += [Output(sheet.name, sheet.tiles) for sheet in sheets]
             found += index_output(band, sheets)
         return found

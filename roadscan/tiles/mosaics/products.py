@@ -27,7 +27,7 @@ from roadscan.tiles.product import (
 )
 from roadscan.tiles.pyramid import Level, pyramid_of
 from roadscan.tiles.tasks.cell_files import read_cells, read_overview
-from roadscan.tiles.tasks.tile_figures import TileFigures, tile_figures
+from roadscan.tiles.tasks.tile_figures import tile_figures
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE
 from roadscan.tiles.tasks.wanted_products import product_context, product_key, wanted_products
 
@@ -178,16 +178,15 @@ def _planned(
     driven = [Drives.of(plan).key()] if product.needs_lanes else []
     own_key = product_key(product, options, context)
     bridged = {TileId.parse(r.unit) for r in files} - found.summaries.keys()  # tiles with a surface and no reading
-    known = [*_in_order(found), *map(TileSummary.without_readings, sorted(bridged))]
-    for output in product.outputs(known, options, context) if found.summaries else []:
+    known = [*sorted(found.summaries), *sorted(bridged)]
+    outputs = product.outputs(known, options, context) if found.summaries else []
+    drawn = {id(one.tiles): one.tiles for one in outputs}  # views of one sheet share them
+    told = {at: [held for tile in tiles if (held := found.contents.get(tile))] for at, tiles in drawn.items()}
+    for output in outputs:
         read = _read(product, files, output)
         parts = [(r.unit, r.digest, r.detail) for r in read]
-        tiles = [found.contents[tile] for tile in output.tiles if tile in found.contents]
-        yield PlannedOutput(product, options, output, key_of(own_key, output.name, tiles, parts, *driven), read)
-
-
-def _in_order(found: TileFigures) -> list[TileSummary]:
-    return [found.summaries[tile] for tile in sorted(found.summaries)]
+        key = key_of(own_key, output.name, told[id(output.tiles)], parts, *driven)
+        yield PlannedOutput(product, options, output, key, read)
 
 
 def _tasks(due: Sequence[PlannedOutput], plan: SurveyPlan, manifest: Manifest) -> list[OutputTask]:

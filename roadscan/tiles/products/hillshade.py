@@ -74,11 +74,11 @@ class Hillshade(SurveyProduct):
     options: ClassVar[type[Strict]] = HillshadeOptions
     default_cells: ClassVar[Cells] = "coarse"
 
-    def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
+    def outputs(self, tiles: Sequence[TileId], options: Strict, context: ProductContext) -> list[Output]:
         """Sheets, the index that joins them, and the picture."""
         sheet_m = cast(HillshadeOptions, options).sheet_m
-        sheets = cut_sheets(_STEM, (t.tile for t in tiles), sheet_m, context.grid)
-        everything = tuple(sorted(t.tile for t in tiles))
+        sheets = cut_sheets(_STEM, tiles, sheet_m, context.grid)
+        everything = tuple(sorted(tiles))
         known = frozenset(everything)
         found = [Output(sheet.name, with_neighbours(sheet, known)) for sheet in sheets]
         found += index_output(_STEM, sheets)
@@ -223,9 +223,14 @@ def shade_in_strips(
 
 
 def with_neighbours(sheet: Sheet, everything: frozenset[TileId]) -> tuple[TileId, ...]:
-    """Return the tiles of a sheet and those of the survey that touch one of them, in order."""
-    around = {TileId(t.column + right, t.row + up) for t in sheet.tiles for right in (-1, 0, 1) for up in (-1, 0, 1)}
-    return tuple(sorted(around & everything))
+    """Return the tiles of a sheet and those of the survey that touch one of them, in order.
+
+    A sheet has all of the survey's tiles within its box, so only those at the box's rim have others around them.
+    """
+    columns, rows = ({of(t[k] for t in sheet.tiles) for of in (min, max)} for k in (0, 1))
+    rim = [t for t in sheet.tiles if t.column in columns or t.row in rows]
+    around = {TileId(t.column + right, t.row + up) for t in rim for right in (-1, 0, 1) for up in (-1, 0, 1)}
+    return tuple(sorted([*sheet.tiles, *(around & everything).difference(sheet.tiles)]))
 
 
 def base_below(tiles: Sequence[TileSummary], output: Output) -> float:

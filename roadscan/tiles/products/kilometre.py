@@ -74,11 +74,11 @@ class Kilometre(SurveyProduct):
     options: ClassVar[type[Strict]] = KilometreOptions
     default_cells: ClassVar[Cells] = "fine"
 
-    def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
+    def outputs(self, tiles: Sequence[TileId], options: Strict, context: ProductContext) -> list[Output]:
         """Sheets of each view and pixel, followed by the index that joins them."""
         settings = cast(KilometreOptions, options)
-        everything = frozenset(one.tile for one in tiles)
-        sheets = cut_sheets("", everything, settings.sheet_m, context.grid)  # the same for all, as names without stem
+        everything = frozenset(tiles)
+        sheets = cut_sheets("", tiles, settings.sheet_m, context.grid)  # the same for all, as names without stem
         index = index_output("", sheets)
         plain = [Output(s.name, s.tiles) for s in sheets] + index
         wanted = sheets if "shaded" in settings.views else ()

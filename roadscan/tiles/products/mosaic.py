@@ -9,6 +9,7 @@ from typing import ClassVar, cast
 import numpy as np
 from pydantic import Field
 
+from roadscan.core.ids import TileId
 from roadscan.core.strict import Strict
 from roadscan.store.codecs.gdal import raster_settings
 from roadscan.tiles.product import Cells, LoadCells, Output, ProductContext, SurveyProduct, TileSummary
@@ -51,12 +52,12 @@ class Mosaic(SurveyProduct):
     options: ClassVar[type[Strict]] = MosaicOptions
     default_cells: ClassVar[Cells] = "coarse"
 
-    def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
+    def outputs(self, tiles: Sequence[TileId], options: Strict, context: ProductContext) -> list[Output]:
         """Sheets of each quantity, followed by the index that joins them."""
         found: list[Output] = []
         settings = cast(MosaicOptions, options)
         for quantity in settings.quantities:
-            sheets = cut_sheets(quantity, (t.tile for t in tiles), settings.sheet_m, context.grid)
+            sheets = cut_sheets(quantity, tiles, settings.sheet_m, context.grid)
             found += [Output(sheet.name, sheet.tiles) for sheet in sheets]
             found += index_output(quantity, sheets)
         return found

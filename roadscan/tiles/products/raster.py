@@ -40,7 +40,7 @@ class CellBox:
     @classmethod
     def around(cls, tiles: Iterable[TileId], grid: TileGrid) -> Self:
         """Return the smallest box that contains all cells of `tiles` (at least one)."""
-        columns, rows = zip(*((t.column, t.row) for t in tiles), strict=True)
+        columns, rows = zip(*tiles, strict=True)
         n, west, south = grid.cells_per_edge, min(columns), min(rows)
         return cls(west * n, south * n, (max(columns) + 1 - west) * n, (max(rows) + 1 - south) * n)
 

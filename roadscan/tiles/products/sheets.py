@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterable, Sequence
@@ -24,6 +25,7 @@ _VRT_TYPES: Final = {"float32": ("Float32", "nan"), "uint8": ("Byte", "0")}
 """GDAL's name and the value of empty cells, by type of the sheets."""
 
 _SHEET_CELLS: Final = 20_000  # Cells along the edge of a sheet, by default.
+_ROW: Final = operator.attrgetter("row")
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,7 @@ def sheet_of(stem: str, output: Output, sheet_m: float | None, grid: TileGrid) -
 
 
 def _from_north_west(tiles: Iterable[TileId]) -> tuple[TileId, ...]:
-    return tuple(sorted(tiles, key=lambda t: (-t.row, t.column)))
+    return tuple(sorted(sorted(tiles), key=_ROW, reverse=True))
 
 
 def _tiles_per_edge(sheet_m: float | None, grid: TileGrid) -> int:
@@ -92,7 +94,8 @@ def index_output(stem: str, sheets: Sequence[Sheet]) -> list[Output]:
 
 def _outermost(tiles: Sequence[TileId]) -> set[TileId]:
     """Return up to four tiles that span the same box as all."""
-    by_column, by_row = [sorted(tiles, key=key) for key in (lambda t: (t.column, t.row), lambda t: (t.row, t.column))]
+    by_column = sorted(tiles)
+    by_row = sorted(by_column, key=_ROW)
     return {by_column[0], by_column[-1], by_row[0], by_row[-1]}
 
 

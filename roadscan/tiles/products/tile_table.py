@@ -10,6 +10,7 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
+from roadscan.core.ids import TileId
 from roadscan.core.strict import Strict
 from roadscan.tiles.product import LoadCells, Output, ProductContext, SurveyProduct, TileSummary
 from roadscan.tiles.products.geo_table import check_geo_table, write_geo_table
@@ -52,9 +53,9 @@ class TileTable(SurveyProduct):
     table: ClassVar[str] = "tiles"
     title: ClassVar[str] = "table of the tiles with their outlines (GeoParquet), for DuckDB, pandas and GIS"
 
-    def outputs(self, tiles: Sequence[TileSummary], options: Strict, context: ProductContext) -> list[Output]:
+    def outputs(self, tiles: Sequence[TileId], options: Strict, context: ProductContext) -> list[Output]:
         """Return one file."""
-        return [Output(_FILE, tuple(sorted(t.tile for t in tiles)))]
+        return [Output(_FILE, tuple(sorted(tiles)))]
 
     def write(
         self,

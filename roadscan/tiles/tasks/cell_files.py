@@ -11,7 +11,7 @@ import functools
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -21,13 +21,15 @@ import pyarrow.parquet as pq
 from roadscan.core.errors import DamagedError, StoreError
 from roadscan.core.ids import TileId
 from roadscan.core.survey import CellColumns
-from roadscan.store.codecs.parquet.number_table import Lists, write_number_groups
 from roadscan.store.damage import UNREADABLE
 from roadscan.store.manifest import OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.store.store import MADE_AGAIN, Store
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.pyramid import Level
+
+if TYPE_CHECKING:
+    from roadscan.store.codecs.parquet.number_table import Lists
 
 HEIGHT_STEP_M: Final = 2.0**-20
 """Heights of surfaces and overviews are rounded to multiples of this (0.95 µm)."""
@@ -47,6 +49,8 @@ _GROUP_ROWS: Final = 1 << 20  # Rows in a row group.
 
 def write_cells(path: Path, cells: TileCells, columns: CellColumns = "full") -> None:
     """Write a tile's cells; same cells, same bytes."""
+    from roadscan.store.codecs.parquet.number_table import write_number_groups
+
     schema, n = _stored("cells", columns), len(cells)
     groups = (_rows_of(cells, schema, k, min(k + _GROUP_ROWS, n)) for k in range(0, n, _GROUP_ROWS))
     write_number_groups(path, schema, groups, _ROUNDED if columns == "surface" else None, _PLACES)
@@ -54,6 +58,8 @@ def write_cells(path: Path, cells: TileCells, columns: CellColumns = "full") -> 
 
 def _rows_of(cells: TileCells, schema: pa.Schema, first: int, end: int) -> dict[str, npt.NDArray[Any] | Lists]:
     """Return the columns of the cells `first` to `end` − 1."""
+    from roadscan.store.codecs.parquet.number_table import Lists
+
     found: dict[str, npt.NDArray[Any] | Lists] = {}
     for field in schema:
         if pa.types.is_list(field.type):
@@ -66,6 +72,8 @@ def _rows_of(cells: TileCells, schema: pa.Schema, first: int, end: int) -> dict[
 
 def write_overviews(path: Path, levels: Sequence[Level]) -> None:
     """Write a tile's overviews with a row group per level, so that one can be read without the others."""
+    from roadscan.store.codecs.parquet.number_table import write_number_groups
+
     schema = _stored("overviews", "full")
     groups = (
         {n: getattr(one, n) for n in schema.names[1:]} | {"factor": np.full(len(one), one.factor, np.uint16)}

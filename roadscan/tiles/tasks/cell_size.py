@@ -8,7 +8,7 @@ counted and not modelled; no reading is read again.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -17,13 +17,13 @@ import numpy.typing as npt
 
 from roadscan.core.errors import RoadscanError
 from roadscan.core.grid import ENOUGH, LARGEST_M, TileGrid
+from roadscan.core.ids import TileId
 from roadscan.core.survey import Survey
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.product import TileSummary
 from roadscan.tiles.tasks.cell_files import read_cells
-from roadscan.tiles.tasks.tile_figures import tile_figures
+from roadscan.tiles.tasks.tile_figures import Summaries, tile_figures
 from roadscan.tiles.tasks.tile_plan import TILE
 
 _SAMPLED: Final = 4
@@ -74,7 +74,8 @@ def _readings(number: float) -> str:
 
 def _density(grid: TileGrid, store: Store, manifest: Manifest) -> CellDensity | None:
     """Return the density of the fullest tiles; None where there are none, or cells have plenty."""
-    chosen = _fullest(tile_figures(manifest).summaries.values())
+    summaries = tile_figures(manifest).summaries
+    chosen = [summaries[tile] for tile in _fullest(summaries)]
     if not chosen or sum(one.points for one in chosen) >= _PLENTY * sum(one.cells for one in chosen):
         return None
     records = {record.unit: record for record in manifest.chosen(TILE, [str(one.tile) for one in chosen])}
@@ -82,15 +83,16 @@ def _density(grid: TileGrid, store: Store, manifest: Manifest) -> CellDensity | 
     return cell_density(tiles, grid)
 
 
-def _fullest(tiles: Iterable[TileSummary]) -> list[TileSummary]:
+def _fullest(summaries: Summaries) -> list[TileId]:
     """Return some of the tiles that together have half of all readings, from the fullest to the least full."""
-    ordered = sorted(tiles, key=lambda one: (-one.points, str(one.tile)))
-    if not ordered:
+    points = np.array(summaries.points)
+    if not points.size:
         return []
-    held = np.cumsum([one.points for one in ordered])
-    half = ordered[: int(np.searchsorted(held, held[-1] / 2)) + 1]
-    numbers = np.unique(np.linspace(0, len(half) - 1, _SAMPLED).round().astype(int))
-    return [half[k] for k in numbers.tolist()]
+    order = np.argsort(-points, kind="stable")
+    held = np.cumsum(points[order])
+    half = order[: int(np.searchsorted(held, held[-1] / 2)) + 1]
+    tiles = list(summaries)
+    return [tiles[k] for k in half[np.unique(np.linspace(0, half.size - 1, _SAMPLED).round().astype(int))].tolist()]
 
 
 def cell_density(tiles: Sequence[TileCells], grid: TileGrid) -> CellDensity:

@@ -23,8 +23,8 @@ from roadscan.georeference.sources import Georeferencer, RawSlice, geometry_of
 from roadscan.store.readings.profiles import ProfileReader
 from roadscan.store.readings.returns import ReturnsReader
 from roadscan.store.schema import table_schema
-from roadscan.tiles.accumulator import Accumulator, Pool, PoolExhaustedError, TileEvidence
-from roadscan.tiles.cells import TileCells
+from roadscan.tiles.accumulator import Accumulator, Pool, PoolExhaustedError
+from roadscan.tiles.cells import TileCells, TileEvidence
 from roadscan.tiles.counting import Counting
 from roadscan.tiles.tasks.tile_plan import TileTask
 

@@ -57,19 +57,33 @@ class PlannedTiles(DrivenTiles):
         return tuple(map(TileId._make, zip(self.column.tolist(), self.row.tolist(), strict=True)))
 
     @cached_property
+    def units(self) -> list[str]:
+        """Name of each tile in the manifest."""
+        return [f"{column}_{row}" for column, row in zip(self.column.tolist(), self.row.tolist(), strict=True)]
+
+    @cached_property
     def number(self) -> dict[TileId, int]:
         """Index of each tile in the arrays."""
         return {tile: number for number, tile in enumerate(self.ids)}
 
     def numbers(self, tiles: Iterable[TileId]) -> npt.NDArray[np.int64]:
         """Return the indices of some tiles; raises `KeyError` for an unknown one."""
+        asked = list(tiles)
+        found, is_held = self._found(asked)
+        if not is_held.all():
+            raise KeyError(asked[int(np.argmin(is_held))])
+        return found
+
+    def held(self, tiles: Iterable[TileId]) -> npt.NDArray[np.int64]:
+        """Return the indices of those of some tiles that are among these."""
+        found, is_held = self._found(list(tiles))
+        return found[is_held]
+
+    def _found(self, tiles: Sequence[TileId]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
         wanted = np.array([(tile.row, tile.column) for tile in tiles], dtype=np.int64).reshape(-1, 2)
         place = _places(*wanted.T)
         found = np.searchsorted(self._place, place)
-        missing = self._place.take(found, mode="clip") != place if len(self) else np.ones(found.shape, bool)
-        if missing.any():
-            raise KeyError(TileId(*wanted[missing][0, ::-1].tolist()))
-        return found
+        return found, self._place.take(found, mode="clip") == place if len(self) else np.zeros(found.shape, bool)
 
     @cached_property
     def _place(self) -> npt.NDArray[np.int64]:
@@ -188,13 +202,13 @@ def _correction_digests(f: FootprintRanges, plan: SurveyPlan) -> npt.NDArray[np.
 
 def stale_tiles(tiles: PlannedTiles, products: Sequence[WantedProduct], manifest: Manifest) -> dict[TileId, str]:
     """Tiles that are missing, changed, or lack a wanted product, each with the reason."""
-    units = list(map(str, tiles.ids))
+    units = tiles.units
     found = manifest.reasons(TILE, units, tiles.keys)
     bare = found.keys() | manifest.without_file(TILE)  # without points, and so without files
-    kept = [(unit, key) for unit, key in zip(units, tiles.keys, strict=True) if unit not in bare]
-    own, keys = [unit for unit, _ in kept], [key for _, key in kept]
-    wanted = [(name, keys_beside(keys, one.key)) for one in products for name in one.files]
-    for name, theirs in [(OVERVIEWS, keys), *wanted]:
+    kept = [number for number, unit in enumerate(units) if unit not in bare]
+    own, keys = [units[number] for number in kept], [tiles.keys[number] for number in kept]
+    wanted = ((name, keys_beside(keys, one.key)) for one in products for name in one.files)
+    for name, theirs in itertools.chain([(OVERVIEWS, keys)], wanted):
         for unit, why in manifest.reasons(name, own, theirs).items():
             found.setdefault(unit, f"{name} {why}")
     return {tile: found[unit] for tile, unit in zip(tiles.ids, units, strict=True) if unit in found} if found else {}
@@ -237,8 +251,7 @@ class TilePlan:
 
     def task(self, block: Block) -> TileTask:
         """Return a task over a block."""
-        near = self.tiles.numbers(t for t in block.with_halo() if t in self.tiles)
-        return self._task(block, self.tiles.numbers(block.tiles), near)
+        return self._task(block, self.tiles.numbers(block.tiles), self.tiles.held(block.with_halo()))
 
     def _task(self, block: Block, core: npt.NDArray[np.int64], near: npt.NDArray[np.int64]) -> TileTask:
         """Return a task over the tiles numbered `core`, with the row groups of those numbered `near`."""

@@ -20,7 +20,7 @@ from roadscan.georeference.plan.centre_line import load_buffer
 from roadscan.georeference.reading_counts import ReadingCounts
 from roadscan.georeference.sources import Georeferencer, MapSettings, RawSlice, ReadingSource
 from roadscan.poses.trajectory import Trajectory
-from roadscan.tiles.accumulator import TileEvidence
+from roadscan.tiles.cells import TileEvidence
 from roadscan.tiles.tasks.tile_plan import TileTask
 
 

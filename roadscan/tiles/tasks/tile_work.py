@@ -8,10 +8,9 @@ from dataclasses import dataclass, field
 from roadscan.core.ids import TileId
 from roadscan.footprints.footprints import footprints_of
 from roadscan.georeference.plan.plan import plan_of
-from roadscan.run.memory import BYTES_PER_READING, WORKER_BASE_BYTES
+from roadscan.run.memory import BYTES_PER_READING, MOST_CELL_BYTES, WORKER_BASE_BYTES
 from roadscan.run.session import Session
 from roadscan.store.manifest import OutputRecord
-from roadscan.tiles.accumulator import MOST_BYTES
 from roadscan.tiles.tasks.selection import chosen_tiles
 from roadscan.tiles.tasks.tile_files import tile_file_names
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, TilePlan, TileTask, stale_tiles, tiles_of
@@ -43,12 +42,12 @@ def plan_tile_work(session: Session) -> TileWork:
         chosen = chosen_tiles(session.selection, tiles, footprints, plan.ground.grid)
     per_tile = tile_file_names()
     dropped = per_tile - tile_file_names({w.product.name for w in wanted})
-    gone = manifest.beside({TILE, OVERVIEWS, *per_tile} - dropped, {str(t) for t in tiles})
+    gone = manifest.beside({TILE, OVERVIEWS, *per_tile} - dropped, tiles.units)
     gone += manifest.beside(dropped, ())
     return TileWork(TilePlan(plan, footprints, tiles, wanted, context), chosen, gone, why)
 
 
 def memory_of(tasks: Sequence[TileTask]) -> int:
     """Return the approximate memory (bytes) that a worker needs for the largest of some tasks."""
-    largest = max((t.readings * BYTES_PER_READING if t.needs_points else MOST_BYTES for t in tasks), default=0)
+    largest = max((t.readings * BYTES_PER_READING if t.needs_points else MOST_CELL_BYTES for t in tasks), default=0)
     return WORKER_BASE_BYTES + largest if tasks else 0

@@ -18,17 +18,13 @@ from roadscan.run.engine.compute import Compute, reason_of
 from roadscan.store.manifest import Manifest
 from roadscan.store.records import OutputRecord, Packed, Row, table_of
 from roadscan.store.store import told_if_full
-from roadscan.tiles.accumulator import TileEvidence
 from roadscan.tiles.blocks import Block
-from roadscan.tiles.cells import TileCells
+from roadscan.tiles.cells import TileCells, TileEvidence
 from roadscan.tiles.kernels.cell_figures import median, totals
-from roadscan.tiles.product import Tile, TileSummary
-from roadscan.tiles.statistics import cells_of
+from roadscan.tiles.product import Tile
 from roadscan.tiles.tasks.cell_files import write_cells, write_overviews
 from roadscan.tiles.tasks.passes_apart import FIGURE as PASSES_APART
 from roadscan.tiles.tasks.passes_apart import apart_in_tile
-from roadscan.tiles.tasks.tile_cells import count_tiles
-from roadscan.tiles.tasks.tile_figures import summary_in
 from roadscan.tiles.tasks.tile_files import publish_file, write_product
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, TileTask
 from roadscan.tiles.tasks.tile_points import load_tiles
@@ -147,19 +143,18 @@ def compute_tiles(task: TileTask) -> TaskResult:
 def computed_tiles(task: TileTask, fates: ReadingCounts) -> Iterator[ComputedTile]:
     """Yield the tiles of a task, counted from the readings, or from points where these are needed."""
     if not task.needs_points:
+        from roadscan.tiles.tasks.tile_cells import count_tiles
+
         for counted in count_tiles(task, fates):
             content = None if counted.cells is None else Tile(None, counted.cells)
             yield ComputedTile(counted.tile, content, counted.evidence, counted.failure)
         return
+    from roadscan.tiles.statistics import cells_of
+
     for loaded in load_tiles(task, fates):
         if loaded.points is not None:
             cells = cells_of(loaded.points, task.ground.grid)
             yield ComputedTile(loaded.tile, Tile(loaded.points, cells, loaded.marked), loaded.evidence)
-
-
-def summary_of(record: OutputRecord) -> TileSummary | None:
-    """Return figures of a finished tile; None where it has no point."""
-    return summary_in(TileId.parse(record.unit), record.figures())
 
 
 def _write_tile(task: TileTask, key: str, content: Tile, evidence: TileEvidence, folder: Path) -> list[OutputRecord]:

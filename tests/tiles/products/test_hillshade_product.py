@@ -22,7 +22,7 @@ def hillshade() -> Hillshade:
 
 
 def write_all(hillshade, survey, options, folder):
-    outputs = hillshade.outputs(survey.summaries, options, survey.context)
+    outputs = hillshade.outputs(list(survey.tiles), options, survey.context)
     for output in outputs:
         path = folder / output.name
         own = [s for s in survey.summaries if s.tile in output.tiles]
@@ -127,7 +127,7 @@ def test_no_seam_at_borders_of_tiles_and_sheets(hillshade, survey, tmp_path):
 
 def test_a_sheet_depends_on_the_tiles_around_it(hillshade, survey):
     options = HillshadeOptions(sheet_m=20.0)
-    outputs = {o.name: o for o in hillshade.outputs(survey.summaries, options, survey.context)}
+    outputs = {o.name: o for o in hillshade.outputs(list(survey.tiles), options, survey.context)}
     first = min(survey.tiles)
     own = outputs[f"hillshade_{first.column // 2}_{first.row // 2}.tif"]
     near = {

@@ -47,7 +47,7 @@ def survey_at(workshop, place, offsets=((0, 0), (1, 0), (1, 1), (3, 2)), count=9
 
 def write_all(kilometre, survey, settings, folder):
     found = Overviews(survey)
-    outputs = kilometre.outputs(survey.summaries, settings, survey.context)
+    outputs = kilometre.outputs(list(survey.tiles), settings, survey.context)
     for output in outputs:
         own = [s for s in survey.summaries if s.tile in output.tiles]
         kilometre.write(output, own, found, settings, survey.context, folder / output.name)
@@ -171,7 +171,7 @@ def test_pixels_are_the_nearest_overview(kilometre, workshop, places):
     survey = survey_at(workshop, places["local"])
 
     def stems(*pixels_m):
-        return {o.name for o in kilometre.outputs(survey.summaries, options(pixels_m=pixels_m), survey.context)}
+        return {o.name for o in kilometre.outputs(list(survey.tiles), options(pixels_m=pixels_m), survey.context)}
 
     assert stems(0.04, 0.16) == {"height_500mm.tif"}  # the smallest there is
     assert stems(1.5, 30.0) == {"height_2000mm.tif", "height_10000mm.tif"}
@@ -209,7 +209,7 @@ def test_what_it_does_not_know_is_refused(kilometre, workshop, places, tmp_path)
         kilometre.write(
             Output("heights.tif", tiles), survey.summaries, Overviews(survey), options(), survey.context, tmp_path / "x"
         )
-    output = kilometre.outputs(survey.summaries, options(), survey.context)[0]
+    output = kilometre.outputs(list(survey.tiles), options(), survey.context)[0]
     gone = Overviews(workshop.survey_of({}, survey.context))
     with pytest.raises(StoreError, match="is listed and has no cells"):
         kilometre.write(output, survey.summaries, gone, options(), survey.context, tmp_path / "x")

@@ -42,7 +42,7 @@ def survey(workshop, place):
 
 
 def write_all(mosaic, survey, options, folder):
-    outputs = mosaic.outputs(survey.summaries, options, survey.context)
+    outputs = mosaic.outputs(list(survey.tiles), options, survey.context)
     for output in outputs:
         path = folder / output.name
         own = [s for s in survey.summaries if s.tile in output.tiles]
@@ -155,7 +155,7 @@ def test_bytes_depend_on_neither_order_nor_name(mosaic, workshop, places, tmp_pa
 
 def test_a_sheet_depends_on_its_own_tiles_alone(mosaic, one_survey, workshop, tmp_path):
     survey, options = one_survey, MosaicOptions(sheet_m=20.0, quantities=("count",))
-    output = mosaic.outputs(survey.summaries, options, survey.context)[0]
+    output = mosaic.outputs(list(survey.tiles), options, survey.context)[0]
     own = {t: one for t, one in survey.tiles.items() if t in output.tiles}
     assert 0 < len(own) < len(survey.tiles)
     early = replace(survey.context, date=dt.date(2020, 1, 1), title="an earlier run was added")
@@ -196,7 +196,7 @@ def test_no_tiles_no_files(mosaic, workshop, places):
 def test_a_listed_tile_without_cells_is_an_error(mosaic, one_survey, tmp_path):
     survey = one_survey
     options = MosaicOptions(quantities=("height",))
-    output = mosaic.outputs(survey.summaries, options, survey.context)[0]
+    output = mosaic.outputs(list(survey.tiles), options, survey.context)[0]
     with pytest.raises(StoreError, match="is listed and has no cells"):
         mosaic.write(output, survey.summaries, lambda tile: None, options, survey.context, tmp_path / "x")
     assert not list(tmp_path.iterdir())  # the scratch file is gone

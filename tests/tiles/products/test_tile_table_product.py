@@ -30,7 +30,7 @@ def survey(workshop, place):
 
 def write(table, survey, path):
     options = NoOptions()
-    (output,) = table.outputs(survey.summaries, options, survey.context)
+    (output,) = table.outputs(list(survey.tiles), options, survey.context)
     assert output.name == "tiles.parquet" and set(output.tiles) == set(survey.tiles)
     table.write(output, survey.summaries, survey.load_cells, options, survey.context, path)
     table.check(path)

@@ -20,8 +20,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.store.codecs.choice import LIBRARY
-from roadscan.store.codecs.kernels import delta_packing, wide_packing
-from roadscan.store.codecs.kernels.delta_packing import room_words
 from roadscan.store.codecs.parquet import pages
 from roadscan.store.codecs.parquet.thrift import Value, binary, boolean, i8, i16, i32, i64, listed, struct
 from roadscan.store.codecs.zlib_stream import crc32
@@ -39,7 +37,6 @@ _UNCOMPRESSED: Final = 0  # compression codec (parquet.thrift)
 _LZ4_RAW: Final = 7  # compression codec (parquet.thrift)
 _SEAL: Final = b"roadscan.footer_crc32"
 _SEAL_DIGITS: Final = 8  # hexadecimal digits of the footer's CRC-32
-_ENCODE: Final = wide_packing.encode if wide_packing.THERE else delta_packing.encode
 _SEALED: Final = re.compile(_SEAL + rb"\x18\x08(.{8})", re.DOTALL)
 _MARRED: Final = re.compile(
     re.escape(_SEAL) + rb"|\x18%c.{%d}\x18\x08[0-9a-f]{8}" % (len(_SEAL), len(_SEAL)), re.DOTALL
@@ -182,9 +179,12 @@ class Writer:
 
     def steps(self, values: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
         """Return the content of a page of differences of bytes or 16-bit numbers (n,), valid until the next one."""
-        if self._words.size < room_words(values.size):
-            self._words = np.empty(room_words(values.size), np.uint64)
-        return self._words.view(np.uint8)[: _ENCODE(values, self._words)]
+        from roadscan.store.codecs.kernels import delta_packing, wide_packing
+
+        if self._words.size < (room := delta_packing.room_words(values.size)):
+            self._words = np.empty(room, np.uint64)
+        encode = wide_packing.encode if wide_packing.THERE else delta_packing.encode
+        return self._words.view(np.uint8)[: encode(values, self._words)]
 
     def pack(self, content: npt.NDArray[np.uint8]) -> Packed:
         """Return the content of a page under LZ4."""

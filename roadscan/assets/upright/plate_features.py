@@ -49,6 +49,12 @@ class PlaneOfPlate(NamedTuple):
     right: Float64
     up: Float64
 
+    def placed(self, scene: Scene, rows: Int64) -> tuple[Float64, Float64, Float64]:
+        """Returns how far right and up of the middle some returns lie, and how far off the plane (k,; m)."""
+        returns = scene.returns
+        past = np.column_stack([returns.x_m[rows], returns.y_m[rows], returns.height_m[rows]]) - self.middle
+        return past @ self.right, past @ self.up, np.abs(past @ self.normal)
+
 
 def features_of(
     scene: Scene, plane: PlaneOfPlate, outline: Outline, beams: Beams | None, residual_m: float, beside: float,
@@ -58,9 +64,8 @@ def features_of(
 
     beside : share of the returns on its plane that lie just outside of it. above_m : height of its middle above ground.
     """
-    returns, near = scene.returns, plane.near
-    past = np.column_stack([returns.x_m[near], returns.y_m[near], returns.height_m[near]]) - plane.middle
-    u, v, away = past @ plane.right, past @ plane.up, np.abs(past @ plane.normal)
+    near = plane.near
+    u, v, away = plane.placed(scene, near)
     wide, tall = outline.width_m / 2, outline.height_m / 2
     inside = (np.abs(u) < wide) & (np.abs(v) < tall)
     column = (np.abs(u) < wide + 0.1) & (away < 0.25)
@@ -72,7 +77,7 @@ def features_of(
     light = brightness(scene)[plane.rows]
     green = np.isin(scene.classes[near[around]], _VEGETATION)
     return {
-        "returns": math.log(number), "range_m": float(np.median(returns.ranges_m(plane.rows))),
+        "returns": math.log(number), "range_m": float(np.median(scene.returns.ranges_m(plane.rows))),
         "bright_median": float(np.median(light)), "bright_high": float(np.quantile(light, 0.9)),
         "residual_m": residual_m, "beside": beside,
         "behind": float((inside & (away > _THIN_M) & (away < _BEHIND_M)).sum()) / number,

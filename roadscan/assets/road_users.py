@@ -43,6 +43,10 @@ _BODY: Final = 0b111100
 """Levels at which a vehicle has its body, as bits: 0.4–1.2 m."""
 _BANDS: Final = ((1, 2), (2, 4), (4, 6), (6, 8), (8, 10), (10, 14), (14, 22))
 """Levels of the profile, each from the first up to the second: 0.2–0.4, 0.4–0.8 … 2.8–4.4 m."""
+_CABIN_M: Final = 1.1
+"""A cabin, or another part of a vehicle that is higher than most of it, is as long and as wide as this, or more (m)."""
+_WAIST: Final = 6
+"""Level above the body: 1.2 m."""
 _COLUMN_LEVELS: Final = 8
 """A cell in which so many levels are seen is one of a column: a trunk's, a hedge's; a car's sides lean."""
 _PLANAR, _LEAFY = 0.5, 0.42
@@ -114,7 +118,23 @@ def parked_cells(raster: Columns, moving: Bools, bodies: Bodies) -> Int32:
         wider &= (label == 0) | inside
         wider &= raster.top[part] <= reached + 1  # what is taller stands beside it
         found[part][wider] = np.maximum(found[part][wider], reached + 1)
+        upper, highest = _upper_part(raster.levels[part], label == 0, wider)
+        found[part][upper] = np.maximum(found[part][upper], highest[upper] + 1)
     return found
+
+
+def _upper_part(levels: npt.NDArray[np.uint32], free: Bools, body: Bools) -> tuple[Bools, Int32]:
+    """Returns the cells (rows, columns) of what is higher than the body of a vehicle and belongs to it, and its level.
+
+    The ends of a cabin rise behind a bonnet: nothing of them is seen at the height of the body. They belong to it where
+    they touch it and are as wide and long as a cabin; a post and a plate beside a car are narrower.
+    """
+    highest = np.frexp(levels.astype(np.float64))[1].astype(np.int32) - 1
+    upper = free & ((levels & np.uint32(_BODY)) == 0) & (highest >= _WAIST) & (highest < TALL)
+    _, label = cv2.connectedComponents(upper.view(np.uint8), connectivity=8)
+    near = cv2.dilate(body.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    touching = np.unique(label[near & upper]).tolist()
+    return np.isin(label, [k for k in touching if min(sides_m(label == k)) >= _CABIN_M]), highest
 
 
 def groups_of(raster: Columns, moving: Bools, bodies: Bodies) -> Groups:

@@ -10,6 +10,7 @@ from roadscan.assets.ground.grid import Grid
 from roadscan.assets.kind import asset_kinds
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.moving import Columns, load_levels, moving_cells
+from roadscan.assets.road_users import _upper_part
 from roadscan.assets.scene import Box, Scene
 from tests.assets.drives import CAR, PERSON, kitti_drive_returns
 from tests.assets.scenes import semantic_kitti_scene
@@ -27,6 +28,21 @@ def test_parked_cars_are_set_apart_and_little_else() -> None:
     lost = {label: users[labels == label].mean() for label in (50, 51, 70, 71, 80, 81)}
     assert lost.pop(70) <= 0.01
     assert max(lost.values()) <= 0.002, lost
+
+
+def test_a_cabin_behind_a_bonnet_belongs_to_its_vehicle_and_a_plate_beside_it_does_not() -> None:
+    """Cells of 0.2 m: a bonnet of 2 m by 1 m, behind it a cabin of 2 m by 3 m of which three sides are seen, from 1.2 m
+    to 2.4 m above the ground; beside the bonnet a plate 0.6 m wide.
+    """
+    body, levels = np.zeros((16, 30), np.bool_), np.zeros((16, 30), np.uint32)
+    body[3:13, 3:8], levels[3:13, 3:8] = True, 0b111110
+    cabin = np.zeros_like(body)
+    cabin[3:13, 8], cabin[3:13, 22], cabin[3, 8:23] = True, True, True
+    levels[cabin] = 0b111111000000
+    levels[1, 4:7] = 0b111000000000
+    upper, highest = _upper_part(levels, ~body, body)
+    assert np.array_equal(upper, cabin)
+    assert set(highest[cabin].tolist()) == {11}
 
 
 def drive(scans: slice) -> tuple[Scene, np.ndarray]:

@@ -36,7 +36,14 @@ _LEAST_SIGMA_M: Final = 0.002
 """Least σ of the place of a side (m)."""
 _BEYOND_SIDE_M: Final = 0.3
 """Beams that pass a side within this (m) tell how much of a spot has to lie on the plate."""
-_SIDES_THAT_TELL: Final = 4.0  # Number of sides whose errors are independent, of shapes with one size.
+_SIDES_THAT_TELL: Final = 4  # Greatest number of sides whose errors are independent, of shapes with one size.
+_LESS_BETWEEN: Final = (1.0 - math.sqrt(2.0), 1.0 - math.sqrt(0.5))
+"""A spot's width is known along and across the scan. Between both it reaches less than a disc by a share within these
+limits: those of a square and of one on its corner; beams tell which."""
+_LESS_SIGMA: Final = 0.25
+"""1 σ of that share before beams tell it, …"""
+_HOLD_LESS_M: Final = 0.002
+"""… and the weight of that knowledge against beams on the wrong side (m)."""
 _HOLD: Final = 0.002
 """Weight of the first solution, where nothing else determines the result (1/m)."""
 
@@ -131,32 +138,47 @@ def _parting(shape: str, first: Float64, beams: Beams, doubt_m: float) -> tuple[
     ways = np.column_stack([np.cos(angle), np.sin(angle)])
     columns = np.column_stack([ways, *[t(ways) for t in _TEMPLATES[shape]]])
     needed = _needed(columns @ first, ways, beams)
-    within = beams.hits @ ways.T - needed * beams.hit_spot.reach(ways)
-    beyond = beams.passed @ ways.T - needed * beams.passed_spot.reach(ways)
-    within = within[(within - columns @ first).max(axis=1) > -_WELL_INSIDE * first[2:].min()]
+    reach_hit, reach_by = beams.hit_spot.reach(ways), beams.passed_spot.reach(ways)
+    within = beams.hits @ ways.T - needed * reach_hit
+    beyond = beams.passed @ ways.T - needed * reach_by
+    slanted = 2.0 * np.abs(ways[:, 0] * ways[:, 1])
+    reach_hit, reach_by = slanted * reach_hit, slanted * reach_by
+    near = (within - columns @ first).max(axis=1) > -_WELL_INSIDE * first[2:].min()
+    within, reach_hit = within[near], reach_hit[near]
     lines = _half_gap(ways, beams)
-    spot = needed * np.median(beams.hit_spot.reach(ways), axis=0)
-    beyond = np.concatenate([beyond, _expected(first, ways, columns, beams, lines) @ ways.T - spot])
+    spot = np.median(beams.hit_spot.reach(ways), axis=0)
+    expected = _expected(first, ways, columns, beams, lines) @ ways.T - needed * spot
+    beyond = np.concatenate([beyond, expected])
+    reach_by = np.concatenate([reach_by, np.broadcast_to(slanted * spot, expected.shape)])
+    begin = np.append(first, 0.0)
 
     def loss(solution: Float64, blur: float) -> tuple[float, Float64]:
-        value, slope = 0.5 * _HOLD * float(((solution - first) ** 2).sum()), _HOLD * (solution - first)
-        for side, along in ((1.0, within), (-1.0, beyond)):
-            past = along - columns @ solution
+        slope = np.append(_HOLD * (solution[:-1] - first), _HOLD_LESS_M * solution[-1] / _LESS_SIGMA**2)
+        value = 0.5 * float(((solution - begin) * slope).sum())
+        for side, along, reach in ((1.0, within, reach_hit), (-1.0, beyond, reach_by)):
+            past = along + solution[-1] * reach - columns @ solution[:-1]
             nearest = past.argmax(axis=1)
-            past = side * past[np.arange(len(past)), nearest] / blur
+            rows = np.arange(len(past))
+            past = side * past[rows, nearest] / blur
             value += blur * float(np.logaddexp(0.0, past).sum())
-            slope = slope - side * (expit(past) @ columns[nearest])
+            push = side * expit(past)
+            slope[:-1] -= push @ columns[nearest]
+            slope[-1] += float(push @ reach[rows, nearest])
         return value, slope
 
-    solution, value = first, 0.0
+    solution, value = begin, 0.0
+    limits = [(None, None)] * first.size + [_LESS_BETWEEN]
+    options = {"maxiter": 60, "gtol": 1e-4}
     for blur in _BLURS_M:
-        found = minimize(loss, solution, (blur,), method="L-BFGS-B", jac=True, options={"maxiter": 60, "gtol": 1e-4})
+        found = minimize(loss, solution, (blur,), method="L-BFGS-B", jac=True, bounds=limits, options=options)
         solution, value = found.x, float(found.fun)
+    within, beyond = within + solution[-1] * reach_hit, beyond + solution[-1] * reach_by
+    solution = solution[:-1]
     if shape == "rectangle":
         reach = columns @ solution
         solution = solution + np.linalg.solve(columns, _to_sides(within - reach, beyond - reach, lines))
     reach = columns @ solution
-    return value, solution, _sigma_of_size(shape, _rooms(within - reach, beyond - reach, lines), doubt_m)
+    return value, solution, _sigma_of_size(shape, columns, _rooms(within - reach, beyond - reach, lines), doubt_m)
 
 
 def _without_spot(first: Float64, beams: Beams) -> Float64:
@@ -196,12 +218,17 @@ def _rooms(within: Float64, beyond: Float64, half_gap: Float64) -> Float64:
     return room
 
 
-def _sigma_of_size(shape: str, room: Float64, doubt_m: float) -> float:
-    """Returns 1 σ of the size: a side lies anywhere in its room, and as far off as the spots are not known."""
+def _sigma_of_size(shape: str, columns: Float64, room: Float64, doubt_m: float) -> float:
+    """Returns 1 σ of the size: a side lies anywhere in its room, and as far off as the spots are not known.
+
+    columns : (k, n) how far each side moves with place and size. Sides of a diamond, and more so of a triangle, lie
+    nearer to the middle than those of a disc of that width, so that their errors are a greater share of it.
+    """
     side = np.sqrt(room**2 / 12.0 + doubt_m**2 + _LEAST_SIGMA_M**2)
     if shape == "rectangle":
         return float(max(math.hypot(side[0], side[2]), math.hypot(side[1], side[3])))
-    return float(2.0 * np.sqrt(np.mean(side**2) / _SIDES_THAT_TELL))
+    told = min(side.size, _SIDES_THAT_TELL)
+    return float(np.sqrt(np.mean(side**2) / told) / np.mean(columns[:, 2]))
 
 
 def _to_sides(within: Float64, beyond: Float64, half_gap: Float64) -> Float64:

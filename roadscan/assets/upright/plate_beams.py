@@ -12,6 +12,7 @@ import numpy.typing as npt
 from roadscan.assets.kernels.sight import Rays, rays_near
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
+from roadscan.assets.upright.brightness import brightness
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -34,6 +35,8 @@ _WIDE: Final = 0.035
 _AT_ONCE: Final = 2.0  # Lasers fire together that fire within this number of firings of a laser.
 _OF_A_FIRING: Final = 2
 """A laser has this many returns of one stamp at the most where stamps are those of firings."""
+_LEAST_LIGHT: Final = 0.05
+"""Plates are at least so bright, as a multiple of upright things."""
 _LEAST_GAP: Final = 1e-4
 """Lasers nearer to one another (rad) draw the same line."""
 
@@ -50,7 +53,8 @@ class Beams(NamedTuple):
     hit_spot: Spots
     passed_spot: Spots
     lit: Float64
-    """(m,) intensity of what a passing beam met behind the plane as a share of the plate's; 0 where it met nothing."""
+    """(m,) light that came back from behind the plane as a share of the plate's, less by the square of the distance; 0
+    where nothing did."""
 
 
 class Spots(NamedTuple):
@@ -131,9 +135,10 @@ def beams_of(scene: Scene, edge: Int64, rows: Int64, middle: Float64, axes: tupl
     void = [met(*_beside_lines(fan)), met(*_beside_lasers(fan))]
     passed = np.concatenate([at[behind], *(v[0] for v in void)])
     beside = Spots._make(np.concatenate([own[behind], *(v[2][k] for v in void)]) for k, own in enumerate(spots))
-    light = scene.returns.intensity[fan.rows].astype(np.float64)
+    light = brightness(scene)[fan.rows].astype(np.float64)
     lit = np.zeros(len(passed))
-    lit[: np.count_nonzero(behind)] = light[behind] / max(float(np.median(light[hit])), 1.0)
+    farther = (away[behind] / fan.range_m[behind]) ** 2
+    lit[: np.count_nonzero(behind)] = farther * light[behind] / max(float(np.median(light[hit])), _LEAST_LIGHT)
     low, high = at[hit].min(axis=0) - _ABOUT_M, at[hit].max(axis=0) + _ABOUT_M
     near = ((passed > low) & (passed < high)).all(axis=1)
     return Beams(at[hit], fan.line[hit], passed[near], Spots._make(v[hit] for v in spots),

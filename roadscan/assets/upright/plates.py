@@ -54,6 +54,14 @@ _BOARD_M: Final = 0.04
 """Boards, which are larger than signs, are plane within this (m), poses of several passes included."""
 _POST_M: Final = 0.15
 """Levels of a plate narrower than this (m), or than an eighth of the widest, are its post."""
+_POST_GOES_ON_M: Final = 0.6
+"""A post shows within this distance beyond the plate (m), …"""
+_LEAST_OF_POST: Final = 3
+"""… by so many returns or more, …"""
+_POST_RIM_M: Final = 0.02
+"""… and returns so near to one of these, besides the spot, may be its own (m)."""
+_MOST_OF_POST: Final = 0.6
+"""Where more of the plate's returns than this share stand over what goes on beyond it, that is no post."""
 _RIM_SHARE: Final = 0.7
 """Beside returns of full brightness those of this share of it belong to a plate: spots at its rim, dark symbols."""
 _SAME_PLATE: Final = 0.3
@@ -62,7 +70,7 @@ _SPOT_SHARE: Final = 0.25
 """1 σ of where within its spot the middle of a beam lies that a plate just stops, as a share of half the spot."""
 _USUAL_HALF_RAD: Final = math.radians(0.17 / 2.0)
 """Half the angle of a beam whose width is not known (rad): that of common spinning lidars."""
-JUDGE: Final = Judge("sign", "00c8eb2b7c050222")
+JUDGE: Final = Judge("sign", "688a2576ac3354d4")
 
 
 class SignOptions(KindOptions):
@@ -252,7 +260,8 @@ def _plate(scene: Scene, cluster: Int64, bright: npt.NDArray[np.bool_], options:
         return None
     if _stands(scene, near, (place, normal), outline, ground):
         return None
-    beams = beams_of(scene, edge, rows, middle, (right, up))
+    beams = beams_of(scene, _without_post(scene, edge, PlaneOfPlate(rows, near, middle, normal, right, up)), rows,
+                     middle, (right, up))  # fmt: skip
     outline = outline_of(np.column_stack([placed @ right, placed @ up]), beams, _spot(scene, edge))
     place = middle + outline.middle[0] * right + outline.middle[1] * up
     above = float(place[2]) - ground
@@ -262,6 +271,31 @@ def _plate(scene: Scene, cluster: Int64, bright: npt.NDArray[np.bool_], options:
     lean = math.degrees(math.asin(max(-1.0, min(1.0, float(normal[2])))))
     clearance = above - outline.height_m / 2
     return Plate(rows, tuple(map(float, place)), outline, azimuth, lean, clearance, features)  # type: ignore[arg-type]
+
+
+def _without_post(scene: Scene, edge: Int64, plane: PlaneOfPlate) -> Int64:
+    """Returns the returns that tell the outline, without those of a post just below or above the plate.
+
+    A post lies in the columns that go on beyond the plate. What these hold beyond the outermost return beside them is
+    its own.
+    """
+    u, v, _ = plane.placed(scene, edge)
+    own_u, own_v, past_m = plane.placed(scene, plane.near)
+    reach = _spot(scene, edge)
+    reach_m = reach.half_m + reach.doubt_m + _POST_RIM_M
+    kept = np.ones(edge.size, np.bool_)
+    for side in (-1.0, 1.0):
+        end = float((side * v).max())
+        going_on = (side * own_v > end) & (side * own_v < end + _POST_GOES_ON_M) & (np.abs(past_m) < _BEHIND_M)
+        columns = np.sort(own_u[going_on & (own_u > u.min()) & (own_u < u.max())])
+        if columns.size < _LEAST_OF_POST:
+            continue
+        at = np.searchsorted(columns, u)
+        left, right = columns[np.maximum(at - 1, 0)], columns[np.minimum(at, columns.size - 1)]
+        on_post = np.minimum(np.abs(u - left), np.abs(u - right)) < reach_m
+        if on_post.mean() < _MOST_OF_POST:
+            kept &= ~(on_post & (side * v > float((side * v[~on_post]).max())))
+    return edge[kept]
 
 
 def _spot(scene: Scene, rows: Int64) -> Spot:

@@ -25,7 +25,7 @@ class Windows(NamedTuple):
 
     def meet(self, first_gps_ns: npt.NDArray[np.int64], last_gps_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
         """Returns a mask (n,) of the spans (n,) that a window has a part in."""
-        return self.hold(first_gps_ns) | (first_gps_ns // self.apart_ns != last_gps_ns // self.apart_ns)
+        return np.asarray(self.hold(first_gps_ns) | (first_gps_ns // self.apart_ns != last_gps_ns // self.apart_ns))
 
 
 class PlaceSettings(Strict):

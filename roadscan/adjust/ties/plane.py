@@ -94,8 +94,8 @@ def _near(place: Place, readings: Sequence[PassReadings], settings: TieSettings)
     for number, one in enumerate(readings):
         windows, of_pose = np.unique(one.epoch_gps_ns // chosen.apart_ns, return_inverse=True)
         point = np.stack([one.easting_m - place.easting_m, one.northing_m - place.northing_m, one.height_m], axis=-1)
-        inside = (np.abs(point[:, :2]) <= place.radius_m).all(axis=1) & np.isfinite(point[:, 2])
-        inside = np.flatnonzero(inside & chosen.hold(one.epoch_gps_ns)[one.pose])
+        near = (np.abs(point[:, :2]) <= place.radius_m).all(axis=1) & np.isfinite(point[:, 2])
+        inside = np.flatnonzero(near & chosen.hold(one.epoch_gps_ns)[one.pose])
         pose = one.pose[inside].astype(np.int64)
         parts.append((point[inside], pose, len(traverse) + of_pose[pose]))
         traverse += [number] * windows.size

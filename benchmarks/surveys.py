@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.course import CRS, GEODETIC, HOUR_UTC, IMU_HEIGHT_M, WEEK, Course, heave_m
-from benchmarks.packets import write_capture
+from benchmarks.lidar_drive import SPEED_M_PER_S, write_drive
 from benchmarks.pavement import RANGE_STEP_M, Patch, UInt8, UInt16, even_epochs, patch, paved, write_scans
 
 LINE_SPEED_M_PER_S = 27.8
@@ -89,12 +89,10 @@ def pair(folder: Path, length_m: float = 250.0, spacing_m: float = LINE_SPACING_
 
 
 def hdl32e(folder: Path, seconds: float = 60.0) -> BenchSurvey:
-    """A Velodyne HDL-32E in a street at 10 m/s, returns within 30 m; tiles of 50 m, cells of 5 cm."""
-    speed = 10.0
+    """A Velodyne HDL-32E in a simulated street at 10 m/s, returns within 30 m; tiles of 50 m, cells of 5 cm."""
 
     def make(place: Path) -> int:
-        Course(speed, seconds * speed).write_sbet(place / "poses.sbet")
-        readings, mount = write_capture(place / "lidar.pcap", seconds, folder)
+        readings, mount = write_drive(place, seconds)
         stated = f'clock = {{ system = "utc_hour", date = 2026-02-09 }}\noptions = {{ hour = {HOUR_UTC} }}'
         _survey_files(
             place,
@@ -102,10 +100,11 @@ def hdl32e(folder: Path, seconds: float = 60.0) -> BenchSurvey:
             [f'path = "lidar.pcap"\nformat = "velodyne_pcap"\nsensor = "lidar"\n{stated}'],
             tile_m=50.0,
             cell_m=0.05,
+            of_poses='options = { accuracy = "poses.smrmsg" }\n',
         )
         return readings
 
-    return _kept(folder / f"hdl32e_{seconds:g}s", "hdl32e", seconds, seconds * speed, make)
+    return _kept(folder / f"hdl32e_street_{seconds:g}s", "hdl32e", seconds, seconds * SPEED_M_PER_S, make)
 
 
 def sick(folder: Path, seconds: float = 3600.0) -> BenchSurvey:
@@ -171,8 +170,10 @@ def _street() -> Patch:
     return Patch(ranges, intensity)
 
 
-def _survey_files(place: Path, sensors: list[_Sensor], logs: list[str], *, tile_m: float, cell_m: float) -> None:
-    """Write ``SURVEY.toml`` and ``RIG.toml``."""
+def _survey_files(
+    place: Path, sensors: list[_Sensor], logs: list[str], *, tile_m: float, cell_m: float, of_poses: str = ""
+) -> None:
+    """Write ``SURVEY.toml`` and ``RIG.toml``; of_poses : further lines on the log of poses."""
     rig = []
     for one in sensors:
         rig += [f"[sensors.{one.name}]", f'kind = "{one.kind}"', f'axes = "{one.axes}"']
@@ -181,7 +182,7 @@ def _survey_files(place: Path, sensors: list[_Sensor], logs: list[str], *, tile_
             rig += [f"range_min_m = {one.limits[0]}", f"range_max_m = {one.limits[1]}"]
     (place / "RIG.toml").write_text("\n".join(rig) + "\n")
     poses = f'path = "poses.sbet"\nformat = "sbet"\ncrs = "{GEODETIC}"\n' + (
-        f'clock = {{ system = "gps_week_seconds", week = {WEEK} }}'
+        f'clock = {{ system = "gps_week_seconds", week = {WEEK} }}\n{of_poses}'
     )
     lines = ['id = "bench"', 'rig = "RIG.toml"', "[map]", f'crs = "{CRS}"', 'height = "ellipsoidal"']
     lines += ["[tiles]", f"size_m = {tile_m}", f"cell_m = {cell_m}", "[[runs]]", 'id = "drive"']

@@ -14,8 +14,9 @@ import rasterio
 import benchmarks
 from benchmarks import bench_ingest, skilled_user, surveys
 from benchmarks.by_hand import CELL_M, ByHand, from_store
-from benchmarks.course import HOUR_UTC, START_GPS_NS
-from benchmarks.packets import PACKETS_PER_S, repeat_capture
+from benchmarks.course import HOUR_UTC
+from benchmarks.lidar_drive import PACKETS_PER_S, cut_capture, street
+from benchmarks.pipeline import FROM_LOGS
 from benchmarks.roofline import Roofline
 from benchmarks.same_grid import difference_m, pdal_pipeline, with_numpy, with_roadscan, write_points
 from roadscan.core.gpstime import Clock, TimeSystem
@@ -24,6 +25,9 @@ from roadscan.core.survey import Survey
 from roadscan.ingest.reading.format import LogSource, format_named, log_formats
 from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
+from roadscan.run.stage import stages
+from roadscan.simulate.surface import Surface
+from roadscan.simulate.truth import Truth
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
@@ -121,18 +125,40 @@ def test_same_points_same_grid(tmp_path: Path) -> None:
     assert reader["filename"] == str(file)
 
 
-def test_a_repeated_capture_runs_on(recordings: Path, tmp_path: Path) -> None:
-    file = tmp_path / "lidar.pcap"
-    returns = repeat_capture(recordings / "velodyne" / "hdl32e.pcap", file, 0.6)
+def test_a_capture_is_cut_to_its_first_seconds(recordings: Path, tmp_path: Path) -> None:
+    whole, file = recordings / "velodyne" / "hdl32e.pcap", tmp_path / "lidar.pcap"
+    returns = cut_capture(whole, file, 0.1)
+    first, every = epochs_of(file), epochs_of(whole)
+    np.testing.assert_array_equal(first, every[:returns])
+    assert np.ptp(first) == pytest.approx(0.1e9, abs=2e9 / PACKETS_PER_S)
+    with pytest.raises(ValueError, match="too few for 60 s"):
+        cut_capture(whole, file, 60.0)
+
+
+def epochs_of(capture: Path) -> np.ndarray:
     log = format_named("velodyne_pcap")
     clock = Clock(TimeSystem.UTC_HOUR, date=np.datetime64("2026-02-09").item())
-    source = LogSource(file, log.options.parse({"hour": HOUR_UTC}), clock=clock)
-    rows = [item.batch for item in log.read(source, log.header(source))]
-    epochs = np.concatenate([b["epoch_gps_ns"] for b in rows])
-    assert epochs.size == returns
-    assert epochs.min() == pytest.approx(START_GPS_NS, abs=2_000_000)
-    assert epochs.max() - epochs.min() == pytest.approx(0.6e9, abs=2e9 / PACKETS_PER_S)
-    assert np.diff(np.sort(epochs)).max() < 2e9 / PACKETS_PER_S  # no hole where the piece begins again
+    source = LogSource(capture, log.options.parse({"hour": HOUR_UTC}), clock=clock)
+    return np.concatenate([item.batch["epoch_gps_ns"] for item in log.read(source, log.header(source))])
+
+
+def test_a_lidar_drives_through_one_street(tmp_path: Path) -> None:
+    """Cells of the lane lie where the scene says, as well as the poses: what was seen again was still there."""
+    drive, scene = surveys.hdl32e(tmp_path, 2.0), street(2.0)
+    store = Store(str(tmp_path / "store"), "bench")
+    wanted = [one for one in stages() if one.name in FROM_LOGS]
+    run_stages(Session(Survey.load(drive.file), store, Inline()), wanted)
+    assert epochs_of(drive.file.parent / "lidar.pcap").size == drive.readings
+    tiles = [read_cells(store, r, 1000) for r in Manifest(store).of(TILE).values() if r.path]
+    east = np.concatenate([(t.column + 1000.0 * t.tile.column + 0.5) * 0.05 for t in tiles])
+    north = np.concatenate([(t.row + 1000.0 * t.tile.row + 0.5) * 0.05 for t in tiles])
+    height, count = (np.concatenate([getattr(t, name) for t in tiles]) for name in ("height_robust_m", "count"))
+    known = Truth(scene, Surface(scene), tmp_path)
+    station, offset = known.station_offset_m(east, north)
+    lane = (count >= 5) & (station > 0.0) & (station < 20.0) & (np.abs(offset - 1.6) < 1.5)
+    away = height[lane] - known.height_m(east[lane], north[lane])
+    assert lane.sum() > 1000
+    assert np.percentile(np.abs(away), 90) < 0.1
 
 
 def test_roofline() -> None:

@@ -322,7 +322,7 @@ def _placed(
             batch = batch.take(np.arange(0, batch.num_rows, step))
             yield (
                 batch.num_rows * (1 if geometry is None else geometry.readings),
-                placed_readings(batch, one.source, placement),
+                placed_readings(batch, geometry_of(one.source), placement),
             )
 
 

@@ -33,7 +33,7 @@ def sweeps(shifts: np.ndarray, rng: np.random.Generator) -> PassReadings:
     )
     return PassReadings(
         0, "lidar", *all_points.T, np.zeros(len(all_points), np.uint16), np.concatenate(pose),
-        300_000_000 * np.arange(count, dtype=np.int64), body, np.tile(np.eye(3), (count, 1, 1)), returns=True,
+        400_000_000 * np.arange(count, dtype=np.int64), body, np.tile(np.eye(3), (count, 1, 1)), returns=True,
     )  # fmt: skip
 
 
@@ -48,7 +48,7 @@ def test_planes_say_how_far_sweeps_lie_apart_along_their_normals(tied: tuple[Tie
     ties, shifts = tied
     c = ties.columns
     assert set(c["kind"]) == {"plane_tie"}
-    first, second = (c[f"{end}_epoch_gps_ns"] // 300_000_000 for end in ("first", "second"))
+    first, second = (c[f"{end}_epoch_gps_ns"] // 400_000_000 for end in ("first", "second"))
     direction = np.stack([c["direction_east"], c["direction_north"], -c["direction_down"]], axis=-1)
     away = np.einsum("ni,ni->n", direction, shifts[second] - shifts[first])
     error = c["value_m"] - away
@@ -79,7 +79,7 @@ def test_leaves_are_no_planes() -> None:
     cloud = np.array([1000.0, 2000.0, 55.0]) + rng.uniform(-4.0, 4.0, (20_000, 3))
     pose = np.repeat(np.arange(4, dtype=np.int32), 5000)
     bush = PassReadings(
-        0, "lidar", *cloud.T, np.zeros(20_000, np.uint16), pose, 300_000_000 * np.arange(4, dtype=np.int64),
+        0, "lidar", *cloud.T, np.zeros(20_000, np.uint16), pose, 400_000_000 * np.arange(4, dtype=np.int64),
         np.tile([1000.0, 2000.0, 51.7], (4, 1)), np.tile(np.eye(3), (4, 1, 1)), returns=True,
     )  # fmt: skip
     assert ties_at(PLACE, [bush], TieSettings()).observations.size == 0

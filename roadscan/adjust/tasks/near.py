@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, TypeAlias
@@ -12,7 +13,9 @@ import pyarrow as pa
 
 from roadscan.adjust.patches import PassReadings
 from roadscan.adjust.places import Traverse
+from roadscan.adjust.tie_settings import Windows
 from roadscan.core.grid import QUANTA_PER_M
+from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.georeference.place import EIGHT_TO_SIXTEEN_BITS, EVERYWHERE, Placement
 from roadscan.georeference.sources import Georeferencer, MapSettings, RawSlice, ReadingSource, geometry_of, read_rows
 from roadscan.poses.level import LevelPoses, level_poses
@@ -21,9 +24,16 @@ from roadscan.store.store import Store
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
+Bool = npt.NDArray[np.bool_]
 
 _POSE_STEP_NS: Final = 2_000_000
 """Readings this close in time (ns) share a pose: at 30 m/s that shifts arms by 60 mm."""
+_PROBES: Final = 3
+"""Profiles of those near a place that show which of their readings lie there."""
+_AT_ONCE: Final = 64
+"""Readings of profiles are cut off by so many."""
+_BESIDE_M: Final = 0.2
+"""Other profiles see the place with readings so much farther to the side (m)."""
 _KEPT_GROUPS: Final = 8
 """Row groups of profiles cached, as they are stored."""
 _KEPT_RETURNS: Final = 6_000_000
@@ -48,11 +58,16 @@ class NearFile:
     """Approximate number of compressed bytes of the groups."""
 
     @classmethod
-    def of(cls, source: ReadingSource, file: DataFile, spans_gps_ns: Sequence[tuple[int, int]]) -> NearFile | None:
-        """Returns the row groups with readings of some spans; None where there are none."""
+    def of(
+        cls, source: ReadingSource, file: DataFile, spans_gps_ns: Sequence[tuple[int, int]], windows: Windows | None
+    ) -> NearFile | None:
+        """Returns the row groups with readings of some spans; None where there are none. windows : of returns."""
         own = np.array(source.spans(file.group_spans), np.int64).reshape(-1, 2)
         wanted = np.array(spans_gps_ns, np.int64).reshape(-1, 1, 2)
-        near = np.flatnonzero(((own[:, 0] <= wanted[:, :, 1]) & (own[:, 1] >= wanted[:, :, 0])).any(axis=0))
+        inside = ((own[:, 0] <= wanted[:, :, 1]) & (own[:, 1] >= wanted[:, :, 0])).any(axis=0)
+        if windows is not None and source.table == "returns":
+            inside &= windows.meet(*own.T)
+        near = np.flatnonzero(inside)
         if not near.size:
             return None
         share = file.bytes * near.size // max(len(own), 1)
@@ -69,13 +84,18 @@ class NearFile:
         return [self.source.key, *road, self.digest, list(self.groups)]
 
 
-def near_files(sources: Sources, traverses: Iterable[Traverse], runs: Sequence[str]) -> list[NearFile]:
-    """Returns row groups of all sources with readings of some traverses, which number the runs as in `runs`."""
+def near_files(
+    sources: Sources, traverses: Iterable[Traverse], runs: Sequence[str], windows: Windows | None = None
+) -> list[NearFile]:
+    """Returns row groups of all sources with readings of some traverses, which number the runs as in `runs`.
+
+    windows : of the returns of lidars; None where all are wanted.
+    """
     spans: dict[tuple[str, str], list[tuple[int, int]]] = {}
     for one in traverses:
         spans.setdefault((runs[one.run], one.sensor), []).append((one.first_gps_ns, one.last_gps_ns))
     found = [
-        NearFile.of(source, file, wanted)
+        NearFile.of(source, file, wanted, windows)
         for source, files in sources
         if (wanted := spans.get((source.run, source.sensor)))
         for file in files
@@ -86,22 +106,40 @@ def near_files(sources: Sources, traverses: Iterable[Traverse], runs: Sequence[s
 
 @dataclass(frozen=True)
 class Circle:
-    """The circle in which readings are wanted."""
+    """The circle in which readings are wanted, or a strip through its middle."""
 
     easting_m: float
     northing_m: float
     radius_m: float
+    aside_m: float = math.inf
+    """Half the width of the strip."""
+    heading_rad: float = 0.0
+    """Direction of the strip, clockwise from grid north."""
+
+    def holds(self, easting_m: Float64, northing_m: Float64) -> Bool:
+        """Returns a mask of points inside."""
+        east, north = easting_m - self.easting_m, northing_m - self.northing_m
+        inside = np.asarray(east * east + north * north <= self.radius_m**2)
+        if self.aside_m < self.radius_m:
+            inside &= np.abs(east * math.cos(self.heading_rad) - north * math.sin(self.heading_rad)) <= self.aside_m
+        return inside
 
 
 class NearReader:
     """Georeferences readings near places; caches the row groups that the next place may need as well."""
 
     def __init__(
-        self, store: Store, ground: MapSettings, files: Sequence[NearFile], runs: Sequence[str], apart_m: float = 0.0
+        self,
+        store: Store,
+        ground: MapSettings,
+        files: Sequence[NearFile],
+        runs: Sequence[str],
+        apart_m: float = 0.0,
+        windows: Windows | None = None,
     ) -> None:
         """`runs` : all runs of the survey, in the order by which traverses number them.
 
-        apart_m : profiles are thinned to at most this spacing.
+        apart_m : profiles are thinned to at most this spacing. windows : of the returns of lidars, as in `files`.
         """
         self._store, self._frame, self._runs = store, ground.map, runs
         self._placer = Georeferencer(store, ground, [one.slice for one in files], recorded=True)
@@ -109,7 +147,7 @@ class NearReader:
         for one in files:
             self._files.setdefault((one.source.run, one.source.sensor), []).append(one)
         self._kept: dict[tuple[str, int], pa.RecordBatch] = {}
-        self._apart_m = apart_m
+        self._apart_m, self._windows = apart_m, windows
         self._returns: dict[tuple[str, int], PlacedReadings] = {}
 
     def of(self, traverse: Traverse, circle: Circle) -> PassReadings:
@@ -134,10 +172,10 @@ class NearReader:
             profiles = self._profiles(file, group, span)
             if profiles is None:
                 return
-            found = placed_readings(profiles, file.source, self._placer.placement(file.source))
+            placement = self._placer.placement(file.source)
+            found = placed_readings(*_cut(profiles, file.source, placement, circle), placement)
             within = np.ones(len(found.points_m), np.bool_)
-        east, north = found.points_m[:, 0] - circle.easting_m, found.points_m[:, 1] - circle.northing_m
-        near = within & (east * east + north * north <= circle.radius_m**2)
+        near = within & circle.holds(found.points_m[:, 0], found.points_m[:, 1])
         if near.any():
             yield found.chosen(near)
 
@@ -146,7 +184,9 @@ class NearReader:
         known = self._returns.get((file.path, group))
         if known is None:
             batch = read_rows(self._store, file.source, file.path, [group]).combine_chunks().to_batches()[0]
-            known = placed_readings(batch, file.source, self._placer.placement(file.source))
+            if self._windows is not None:
+                batch = _taken(batch, np.flatnonzero(self._windows.hold(batch.column("epoch_gps_ns").to_numpy())))
+            known = placed_readings(batch, None, self._placer.placement(file.source))
             self._returns[file.path, group] = known
             while len(self._returns) > 1 and sum(len(one.points_m) for one in self._returns.values()) > _KEPT_RETURNS:
                 self._returns.pop(next(iter(self._returns)))
@@ -159,10 +199,7 @@ class NearReader:
         rows = np.flatnonzero((column >= span[0]) & (column <= span[1]))
         if not rows.size:
             return None
-        rows = rows[:: self._every(file.source, column[rows])]
-        if rows.size == batch.num_rows:
-            return batch
-        return batch.slice(int(rows[0]), rows.size) if rows[-1] - rows[0] + 1 == rows.size else batch.take(rows)
+        return _taken(batch, rows[:: self._every(file.source, column[rows])])
 
     def _every(self, source: ReadingSource, epochs_gps_ns: Int64) -> int:
         """Returns the stride by which profiles are thinned."""
@@ -249,9 +286,8 @@ class PlacedReadings:
         )
 
 
-def placed_readings(batch: pa.RecordBatch, source: ReadingSource, placement: Placement) -> PlacedReadings:
-    """Returns readings from rows of a source's table that no filter leaves out."""
-    geometry = geometry_of(source)
+def placed_readings(batch: pa.RecordBatch, geometry: ScanGeometry | None, placement: Placement) -> PlacedReadings:
+    """Returns readings from rows of a source's table that no filter leaves out; geometry : of scans."""
     if geometry is None:
         placed = placement.returns(batch, EVERYWHERE)
         corner = placed.tiles.astype(np.int64) * placement.tile_quanta
@@ -267,6 +303,55 @@ def placed_readings(batch: pa.RecordBatch, source: ReadingSource, placement: Pla
         digital = batch.column("intensity").flatten().to_numpy(zero_copy_only=False)
         intensity = digital[kept].astype(np.uint16) * np.uint16(EIGHT_TO_SIXTEEN_BITS)
     return PlacedReadings(points, intensity, kept // geometry.readings, profiles.epoch_gps_ns)
+
+
+def _cut(
+    batch: pa.RecordBatch, source: ReadingSource, placement: Placement, circle: Circle
+) -> tuple[pa.RecordBatch, ScanGeometry | None]:
+    """Returns profiles without the readings at both ends that lie outside a circle, and their geometry.
+
+    Some of the profiles show which readings these are. Where the road is found in profiles, and where readings of a
+    profile follow one another in time, profiles stay whole.
+    """
+    geometry = geometry_of(source)
+    if geometry is None or placement.road is not None or geometry.reading_period_ns:
+        return batch, geometry
+    some = np.unique(np.linspace(0, batch.num_rows - 1, _PROBES).round().astype(np.int64))
+    shown = placement.by_profile(batch.take(some), geometry)
+    near = np.zeros(geometry.readings, np.bool_)
+    for kept, easting, northing in zip(shown.kept, shown.easting_m, shown.northing_m, strict=True):
+        ends = np.flatnonzero(kept)[[0, -1]] if kept.any() else np.zeros(2, np.int64)
+        east, north = np.diff(easting[ends])[0], np.diff(northing[ends])[0]
+        length = max(math.hypot(east, north), 1e-9)
+        # How far along its profile each reading lies from the point that is nearest to the middle.
+        along = ((easting - circle.easting_m) * east + (northing - circle.northing_m) * north) / length
+        near |= kept & (np.abs(along) <= min(circle.radius_m, circle.aside_m) + _BESIDE_M)
+    columns = np.flatnonzero(near)
+    if not columns.size:
+        return batch.slice(0, 0), geometry
+    # Whole multiples: what follows from a geometry is kept, and neighbours share it.
+    low = int(columns[0]) // _AT_ONCE * _AT_ONCE
+    end = min((int(columns[-1]) // _AT_ONCE + 1) * _AT_ONCE, geometry.readings)
+    if end - low == geometry.readings:
+        return batch, geometry
+    arrays = [_columns(one, low, end) if pa.types.is_fixed_size_list(one.type) else one for one in batch.columns]
+    changed = {"first": geometry.first + low * geometry.step, "readings": end - low}
+    return pa.RecordBatch.from_arrays(arrays, batch.schema.names), geometry.model_copy(update=changed)
+
+
+def _columns(lists: pa.FixedSizeListArray, low: int, end: int) -> pa.FixedSizeListArray:
+    """Returns the elements from `low` to below `end` of each list; where lists are missing, all are."""
+    if lists.null_count:
+        return pa.nulls(len(lists), pa.list_(lists.type.value_type, end - low))
+    values = lists.flatten().to_numpy().reshape(len(lists), -1)[:, low:end]
+    return pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), end - low)
+
+
+def _taken(batch: pa.RecordBatch, rows: Int64) -> pa.RecordBatch:
+    """Returns rows of a batch, ascending; those that follow one another are not copied."""
+    if rows.size and rows[-1] - rows[0] + 1 == rows.size:
+        return batch.slice(int(rows[0]), rows.size)
+    return batch.take(rows)
 
 
 def _ranked(numbers: Int64) -> tuple[Int64, Int64]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
@@ -38,6 +39,9 @@ _PLACES: Final = 50
 """Places of a task: a quarter of a kilometre of one road at the usual spacing."""
 _SEAM_CELLS: Final = 40
 """Least number of cells that both heads saw at a seam: a strip that is one cell wide has 160 along 4 m."""
+_SEAM_ASIDE_M: Final = 0.25
+"""Half the width of road that is read at a seam (m): the strip that both heads saw is at most as wide as the narrowest
+of other ties, 0.2 m, and swings to the side along the patch."""
 DIAGONAL: Final = 1.5
 """Readings are taken within this many radii of a place: the square's corners, and some margin."""
 _APART: Final = 0.25
@@ -98,7 +102,7 @@ def tie_tasks(
     tasks = []
     for start in range(0, len(places), _PLACES):
         own, moved = tuple(places[start : start + _PLACES]), tuple(shifts[start : start + _PLACES])
-        files = tuple(near_files(sources, [t for place in own for t in place.traverses], runs))
+        files = tuple(near_files(sources, [t for place in own for t in place.traverses], runs, settings.windows))
         seen = [one.key(road_key(one.source)) for one in files]
         key = key_of(shaping, [asdict(place) for place in own], seen, *([number, moved] if number else []))
         tasks.append(TieTask(plan.store, plan.ground, settings, runs, own, files, key, number, moved))
@@ -107,7 +111,8 @@ def tie_tasks(
 
 def collect_ties(task: TieTask) -> OutputRecord:
     """Compare the passes at some places and write the ties (runs on a worker)."""
-    reader = NearReader(task.store, task.ground, task.files, task.runs, _APART * task.settings.shift_cell_m)
+    apart_m, windows = _APART * task.settings.shift_cell_m, task.settings.windows
+    reader = NearReader(task.store, task.ground, task.files, task.runs, apart_m, windows)
     moves = zip(task.places, task.shifts_m or [None] * len(task.places), strict=True)
     found = Ties.joined([ties_of(reader, place, task.settings, shifts) for place, shifts in moves])
     if not found.observations.size:
@@ -121,14 +126,17 @@ def collect_ties(task: TieTask) -> OutputRecord:
 
 def ties_of(reader: NearReader, place: Place, settings: TieSettings, shifts_m: Sequence[Shift] | None = None) -> Ties:
     """Returns ties of a place, of traverses that may be shifted, expressed in the recorded poses."""
+    aside_m = math.inf
     if place.seam:
         settings = settings.model_copy(update={"least_cells": min(settings.least_cells, _SEAM_CELLS)})
+        aside_m = _SEAM_ASIDE_M
     if shifts_m is None:
         shifts_m = [(0.0, 0.0, 0.0)] * len(place.traverses)
     readings, moved = list[PassReadings](), dict[tuple[int, str], list[tuple[Traverse, npt.NDArray[Any]]]]()
     for traverse, shift in zip(place.traverses, np.array(shifts_m), strict=True):
         reach = DIAGONAL * place.radius_m + float(np.hypot(*shift[:2]))
-        own = reader.of(traverse, Circle(place.easting_m, place.northing_m, reach))
+        circle = Circle(place.easting_m, place.northing_m, reach, aside_m, place.heading_rad)
+        own = reader.of(traverse, circle)
         readings.append(shifted(own, shift))
         moved[traverse.run, traverse.sensor] = [*moved.get((traverse.run, traverse.sensor), []), (traverse, shift)]
     found = ties_at(place, readings, settings)

@@ -12,7 +12,7 @@ from roadscan.adjust.places import Track
 from roadscan.adjust.swath import Swath, swath_of
 from roadscan.adjust.tasks.near import PlacedReadings, Sources, placed_readings
 from roadscan.georeference.plan.plan import SurveyPlan
-from roadscan.georeference.sources import Georeferencer, RawSlice, ReadingSource, read_rows
+from roadscan.georeference.sources import Georeferencer, RawSlice, ReadingSource, geometry_of, read_rows
 from roadscan.navigation.tasks.trajectories import load_recorded
 from roadscan.poses.level import LevelPoses, level_poses
 from roadscan.store.logs import DataFile
@@ -108,7 +108,7 @@ def _swath(plan: SurveyPlan, source: ReadingSource, files: Sequence[DataFile]) -
     for own in slices:
         batch = read_rows(plan.store, source, own.file, own.groups).combine_chunks().to_batches()[0]
         most = _SAMPLE_ROWS if source.table == "scans" else _SAMPLE_RETURNS
-        parts.append(placed_readings(batch.take(_spread(batch.num_rows, most)), source, placement))
+        parts.append(placed_readings(batch.take(_spread(batch.num_rows, most)), geometry_of(source), placement))
     found = PlacedReadings.joined(parts)
     every = _spread(len(found.points_m), _SAMPLE_RETURNS)
     points, when = found.points_m[every], found.epoch_gps_ns[found.row[every]]

@@ -20,7 +20,6 @@ from roadscan.adjust.patches import PassReadings, level_from_map
 from roadscan.adjust.places import Place
 from roadscan.adjust.tie_settings import TieSettings
 from roadscan.adjust.ties.tie import COUNTS, PLANE, TOO_FAR, End, Tie
-from roadscan.core.gpstime import NS_PER_S
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -75,7 +74,7 @@ class _Planes:
 
 
 def plane_ties(place: Place, readings: Sequence[PassReadings], settings: TieSettings) -> list[Tie]:
-    """Returns ties along the normals of planes between windows of `settings.window_s`, those of a cube in a ring.
+    """Returns ties along the normals of planes between the windows of `settings.windows`, those of a cube in a ring.
 
     Redundant ties have larger σ: q ties of m windows have m − 1 independent values.
     """
@@ -89,13 +88,14 @@ def plane_ties(place: Place, readings: Sequence[PassReadings], settings: TieSett
 
 def _near(place: Place, readings: Sequence[PassReadings], settings: TieSettings) -> _Returns:
     """Returns the lidar returns within the square of a place."""
-    length = round(settings.window_s * NS_PER_S)
+    chosen = settings.windows
     parts: list[tuple[Float64, Int64, Int64]] = []
     traverse: list[int] = []
     for number, one in enumerate(readings):
-        windows, of_pose = np.unique(one.epoch_gps_ns // length, return_inverse=True)
+        windows, of_pose = np.unique(one.epoch_gps_ns // chosen.apart_ns, return_inverse=True)
         point = np.stack([one.easting_m - place.easting_m, one.northing_m - place.northing_m, one.height_m], axis=-1)
-        inside = np.flatnonzero((np.abs(point[:, :2]) <= place.radius_m).all(axis=1) & np.isfinite(point[:, 2]))
+        near = (np.abs(point[:, :2]) <= place.radius_m).all(axis=1) & np.isfinite(point[:, 2])
+        inside = np.flatnonzero(near & chosen.hold(one.epoch_gps_ns)[one.pose])
         pose = one.pose[inside].astype(np.int64)
         parts.append((point[inside], pose, len(traverse) + of_pose[pose]))
         traverse += [number] * windows.size

@@ -121,11 +121,11 @@ class TieSettings(Strict):
     """A direction that is known worse than this makes no tie (m, 1 σ)."""
     shift_floor_m: float = Field(default=2e-4, gt=0.0)
     """No shift is known better than this (m, 1 σ): spacing of readings, what a pose changes within a patch."""
-    window_s: float = Field(default=0.1, gt=0.0)
+    window_s: float = Field(default=0.2, gt=0.0)
     """Returns of a lidar that are taken together as seen from one pose (s)."""
-    windows_apart_s: float = Field(default=0.4, ge=0.0)
-    """From one of these windows to the next (s): poses err smoothly, and what a lidar sees between is not read. One
-    window follows the other where this is less than `window_s`."""
+    windows_apart_s: float = Field(default=0.0, ge=0.0)
+    """From one of these windows to the next (s); what a lidar sees between is not read, which takes less time and knows
+    poses less well. One window follows the other where this is less than `window_s`."""
     plane_cell_m: float = Field(default=1.0, gt=0.0)
     """Edge of the cubes in which planes are sought (m)."""
     least_returns: int = Field(default=8, ge=3)

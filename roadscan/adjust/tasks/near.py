@@ -59,7 +59,11 @@ class NearFile:
 
     @classmethod
     def of(
-        cls, source: ReadingSource, file: DataFile, spans_gps_ns: Sequence[tuple[int, int]], windows: Windows | None
+        cls,
+        source: ReadingSource,
+        file: DataFile,
+        spans_gps_ns: Sequence[tuple[int, int]],
+        windows: Windows | None = None,
     ) -> NearFile | None:
         """Returns the row groups with readings of some spans; None where there are none. windows : of returns."""
         own = np.array(source.spans(file.group_spans), np.int64).reshape(-1, 2)

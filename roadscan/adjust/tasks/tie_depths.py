@@ -17,7 +17,7 @@ from roadscan.adjust.tasks.near import NearFile, placed_readings
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.plan.road import road_key
-from roadscan.georeference.sources import Georeferencer, MapSettings, ReadingSource, read_rows
+from roadscan.georeference.sources import Georeferencer, MapSettings, ReadingSource, geometry_of, read_rows
 from roadscan.pictures.exposures import Exposures
 from roadscan.pictures.lens import pixels_of
 from roadscan.run.code_reach import code_digest
@@ -144,7 +144,7 @@ def write_returns(task: DepthTask) -> OutputRecord:
         for group in file.groups:
             rows = read_rows(task.store, file.source, file.path, [group]).combine_chunks()
             for batch in rows.to_batches():
-                placed = placed_readings(batch, file.source, placer.placement(file.source))
+                placed = placed_readings(batch, geometry_of(file.source), placer.placement(file.source))
                 for k in range(count):
                     parts[k].append(_near(task, k, placed.points_m, placed.epoch_gps_ns))
     points = [np.concatenate([np.zeros((0, 3)), *own]) for own in parts]

@@ -26,7 +26,7 @@ from roadscan.assets.scene import Box, Scene
 from roadscan.assets.upright.plates import Plate, SignOptions, candidates_of
 from roadscan.simulate import Scene as Street
 
-HARD: Final = range(700, 708)
+HARD: Final = (*range(700, 708), *range(712, 716))
 SIGNS: Final = range(80, 85)
 DRAWN: Final = range(200, 208)
 """Seeds of hard streets, of streets of signs, and of plain ones, whose parked cars are no signs either."""
@@ -38,7 +38,7 @@ _AROUND_M, _STEP_M = 30.0, 10.0
 FIT: Final = {
     "rounds": 80, "num_leaves": 5, "min_data_in_leaf": 6,
     "increasing": ("bright_median", "bright_high", "filled"),
-    "decreasing": ("residual_m", "beside", "behind", "misfit", "passed", "tilt"),
+    "decreasing": ("residual_m", "beside", "behind", "vehicle", "misfit", "passed", "tilt"),
 }  # fmt: skip
 
 

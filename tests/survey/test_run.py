@@ -400,7 +400,7 @@ def test_a_tile_that_could_not_be_made_again_counts_as_stale(
         raise OSError("disk full")
 
     with monkeypatch.context() as patch:
-        patch.setattr("roadscan.tiles.tasks.tiles.cells_of", broken)
+        patch.setattr("roadscan.tiles.statistics.cells_of", broken)
         with pytest.raises(RunError, match=rf"tiles {unit}: OSError: disk full"):
             copy.run(selection=Selection(named=(TileId.parse(unit),)))
     assert survey_status(Session(Survey.load(copy.survey_file), store)).of("tiles").stale == 1

@@ -7,8 +7,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from roadscan.assets import classes
+from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.brightness import brightness
 from roadscan.assets.upright.outlines import Outline
@@ -24,8 +26,8 @@ _BELOW_M: Final = 1.0
 """What carries a plate is looked at down to this far below it (m)."""
 _AROUND_M: Final = 0.5
 """What surrounds a plate lies this far beyond its outline, at the most (m)."""
-_DEEP_M: Final = 0.9
-"""A body or a room, whose front a plate is, goes on behind it as far as this (m)."""
+_VEHICLE_M: Final = 0.8
+"""Returns of vehicles are counted within this distance, seen from above (m)."""
 _WALL_M: Final = 2.0
 """Large surfaces farther off than this (m) do not matter."""
 _LONG_M: Final = 2.5
@@ -48,10 +50,10 @@ class PlaneOfPlate(NamedTuple):
     up: Float64
 
     def placed(self, scene: Scene, rows: Int64) -> tuple[Float64, Float64, Float64]:
-        """Returns how far right and up of the middle, and before the plane, some returns lie (k,; m)."""
+        """Returns how far right and up of the middle some returns lie, and how far off the plane (k,; m)."""
         returns = scene.returns
         past = np.column_stack([returns.x_m[rows], returns.y_m[rows], returns.height_m[rows]]) - self.middle
-        return past @ self.right, past @ self.up, past @ self.normal
+        return past @ self.right, past @ self.up, np.abs(past @ self.normal)
 
 
 def features_of(
@@ -63,12 +65,10 @@ def features_of(
     beside : share of the returns on its plane that lie just outside of it. above_m : height of its middle above ground.
     """
     near = plane.near
-    u, v, past_m = plane.placed(scene, near)
-    away = np.abs(past_m)
+    u, v, away = plane.placed(scene, near)
     wide, tall = outline.width_m / 2, outline.height_m / 2
     inside = (np.abs(u) < wide) & (np.abs(v) < tall)
-    over = np.abs(u) < wide + 0.1
-    column = over & (away < 0.25)
+    column = (np.abs(u) < wide + 0.1) & (away < 0.25)
     below = column & (v < -tall - 0.05) & (v > -tall - _BELOW_M)
     on_top = column & (v > tall + 0.05) & (v < tall + _AROUND_M)
     about = (np.abs(u) < wide + _AROUND_M) & (np.abs(v) < tall + _AROUND_M) & (away < _AROUND_M)
@@ -89,8 +89,8 @@ def features_of(
         "ratio": math.log(outline.height_m / outline.width_m),
         "misfit": outline.misfit_m / min(outline.width_m, outline.height_m), "tilt": abs(float(plane.normal[2])),
         "filled": _filled(u, v, inside & (away < _THIN_M), wide, tall),
-        "passed": _passed(beams, outline), "wall_m": _to_wall(scene, plane),
-        "deep": float((over & (np.abs(v) < tall) & (past_m < -_BEHIND_M) & (past_m > -_DEEP_M)).sum()) / number,
+        "passed": _passed(beams, outline), "vehicle": _vehicles(scene, plane.middle) / number,
+        "wall_m": _to_wall(scene, plane),
     }  # fmt: skip
 
 
@@ -112,6 +112,18 @@ def _passed(beams: Beams | None, outline: Outline) -> float:
         float((np.abs(b - outline.middle) < half).all(axis=1).sum()) for b in (beams.passed, beams.hits)
     )
     return through / max(through + stopped, 1.0)
+
+
+def _vehicles(scene: Scene, middle: Float64) -> float:
+    """Returns the number of returns of vehicles beside a place."""
+    tree = _tree_of_vehicles(scene)
+    return 0.0 if tree is None else float(tree.query_ball_point(middle[:2], _VEHICLE_M, return_length=True))
+
+
+@once_a_scene
+def _tree_of_vehicles(scene: Scene) -> cKDTree | None:
+    rows = np.flatnonzero(scene.classes == classes.VEHICLE)
+    return cKDTree(np.column_stack([scene.returns.x_m[rows], scene.returns.y_m[rows]])) if rows.size else None
 
 
 def _to_wall(scene: Scene, plane: PlaneOfPlate) -> float:

@@ -70,7 +70,7 @@ _SPOT_SHARE: Final = 0.25
 """1 σ of where within its spot the middle of a beam lies that a plate just stops, as a share of half the spot."""
 _USUAL_HALF_RAD: Final = math.radians(0.17 / 2.0)
 """Half the angle of a beam whose width is not known (rad): that of common spinning lidars."""
-JUDGE: Final = Judge("sign", "688a2576ac3354d4")
+JUDGE: Final = Judge("sign", "00c8eb2b7c050222")
 
 
 class SignOptions(KindOptions):
@@ -280,13 +280,13 @@ def _without_post(scene: Scene, edge: Int64, plane: PlaneOfPlate) -> Int64:
     its own.
     """
     u, v, _ = plane.placed(scene, edge)
-    own_u, own_v, past_m = plane.placed(scene, plane.near)
+    own_u, own_v, away = plane.placed(scene, plane.near)
     reach = _spot(scene, edge)
     reach_m = reach.half_m + reach.doubt_m + _POST_RIM_M
     kept = np.ones(edge.size, np.bool_)
     for side in (-1.0, 1.0):
         end = float((side * v).max())
-        going_on = (side * own_v > end) & (side * own_v < end + _POST_GOES_ON_M) & (np.abs(past_m) < _BEHIND_M)
+        going_on = (side * own_v > end) & (side * own_v < end + _POST_GOES_ON_M) & (away < _BEHIND_M)
         columns = np.sort(own_u[going_on & (own_u > u.min()) & (own_u < u.max())])
         if columns.size < _LEAST_OF_POST:
             continue

@@ -201,6 +201,7 @@ class AssetTruth:
             where another one is still at work after `wait_s`.
         """
         if not self.store.is_folder or fcntl is None:
+            self._count_last()
             yield
             return
         file = Path(self.store.path(_LOCK))
@@ -215,9 +216,19 @@ class AssetTruth:
             _take(opened, file, time.monotonic() + wait_s)
             self.store.clear_staging()
             self.renew()
+            self._count_last()
             yield
         finally:
             os.close(opened)
+
+    def _count_last(self) -> None:
+        """Count the last commit, too, where its writer was killed before it did."""
+        with contextlib.suppress(DamagedError):  # who reads the commits is told
+            if self._known() < len(self.commits):
+                self._count(len(self.commits))
+
+    def _count(self, commits: int) -> None:
+        self.store.write_bytes(_HEAD, checked_json({"commits": commits}))
 
     def append(self, draft: Draft, rows: pa.Table | None = None) -> Commit:
         """Append a commit, which is on the disk on return; call it within :meth:`alone`."""
@@ -243,7 +254,7 @@ class AssetTruth:
                 "another program appended to the inventory", change="try again", file=self.store.path(name)
             )
         self.store.write_bytes(name, _content(pa.Table.from_pylist([asdict(commit)], schema)))
-        self.store.write_bytes(_HEAD, checked_json({"commits": number}))
+        self._count(number)
         self._commits = (*self.commits, commit)
         return commit
 

@@ -200,6 +200,22 @@ def test_two_writers_at_once_wait_or_are_told(tmp_path: Path) -> None:
         pass
 
 
+def test_a_last_commit_that_its_killed_writer_did_not_count_is_missed_when_it_goes(tmp_path: Path) -> None:
+    street = inventory(tmp_path, Everywhere())
+    head = Path(street.truth.store.path("inventory/head.json"))
+    street.record(found(poles()))
+    before = head.read_bytes()
+    street.record(found(poles(5, when=AUTUMN)))
+    whole = head.read_bytes()
+    head.write_bytes(before)  # as a kill between both leaves it
+    with street.truth.alone():
+        pass
+    assert head.read_bytes() == whole
+    next(Path(street.truth.store.path("tables/asset_commits")).glob("*2.parquet")).unlink()
+    with pytest.raises(DamagedError, match="commit 2 of the inventory is missing"):
+        inventory(tmp_path).state()
+
+
 def test_damage_of_the_truth_is_named(tmp_path: Path) -> None:
     street = inventory(tmp_path, Everywhere())
     street.record(found(poles()))

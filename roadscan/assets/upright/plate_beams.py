@@ -53,8 +53,8 @@ class Beams(NamedTuple):
     hit_spot: Spots
     passed_spot: Spots
     lit: Float64
-    """(m,) light that came back from behind the plane as a share of the plate's, less with the square of the distance; 0
-    where nothing did."""
+    """(m,) light that came back from behind the plane as a share of the plate's, less with the square of the distance;
+    0 where nothing did."""
 
 
 class Spots(NamedTuple):

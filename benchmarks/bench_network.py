@@ -20,7 +20,7 @@ from typing import Any, TypeAlias
 
 import psutil
 
-from benchmarks.kept_stores import of_fleet, of_folder, of_object_store
+from benchmarks.kept_stores import of_fleet, of_folder, of_object_store, of_site
 from benchmarks.network import Region
 from benchmarks.scheduler import Watched, running_scheduler
 from benchmarks.settings import Settings
@@ -105,6 +105,7 @@ def figures(folder: Path) -> Iterator[Figure]:
     yield from _of_stage("products", seen.products)
     yield from of_folder(folder / "large", size.status_km)
     yield from of_object_store(folder / "objects", size.objects_km)
+    yield from of_site(folder / "site")
     yield from of_fleet(folder / "fleet", size.fleet_surveys)
 
 

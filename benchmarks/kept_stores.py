@@ -1,4 +1,4 @@
-"""What commands cost on simulated stores: a large one in a folder, one in an object store, a fleet."""
+"""What commands cost on simulated stores: a large one in a folder, two in an object store, a fleet."""
 
 from __future__ import annotations
 
@@ -21,6 +21,8 @@ _REQUESTS = 100.0
 _POSES_PER_S = 200
 """Of the survey in the object store, as a real drive has them."""
 _FLEET_KM = 1.0
+_SITE_KM = 0.5
+"""Of the survey that is published: each tile is drawn in hundreds of pictures."""
 
 
 def of_folder(folder: Path, km: float) -> Iterator[Figure]:
@@ -54,6 +56,24 @@ def of_object_store(folder: Path, km: float) -> Iterator[Figure]:
             _check(done.code, done.output)
             told = "idle run" if name == "run" else name
             yield Figure(f"{held:,} objects: requests of {told}", len(objects.requests), "", bar, "bar" if bar else "")
+            yield Figure(f"{held:,} objects: {told}, peak memory", done.peak_mb, "MB")
+
+
+def of_site(folder: Path) -> Iterator[Figure]:
+    """Requests of `publish` to moto's S3 server: of a new site, and again of the same."""
+    from tests.object_store import served
+
+    with served() as objects:
+        file = simulated_survey(folder, "site", 1000 * _SITE_KM, f"{objects.url}/roads", _POSES_PER_S)
+        store = _ran(file, _SITE_KM)
+        tiles = Manifest(store).files()["tile"]
+        held = len(store.fs.find(store.root))
+        for told in ("publish", "publish again"):
+            objects.requests.clear()
+            done = command("publish", file, "--no-clouds", "--out", folder / "published")
+            _check(done.code, done.output)
+            yield Figure(f"{held:,} objects, {tiles:,} tiles: requests of {told}", len(objects.requests), "")
+            yield Figure(f"{held:,} objects: {told}, processor time", done.cpu_s, "s")
             yield Figure(f"{held:,} objects: {told}, peak memory", done.peak_mb, "MB")
 
 

@@ -47,6 +47,7 @@ from roadscan.strips.work import PRODUCT as STRIPS
 from roadscan.strips.work import StripTask
 from roadscan.survey.run import run_stages
 from roadscan.tiles.product import Tile
+from roadscan.tiles.pyramid import overview_factors, pyramid_of
 from roadscan.tiles.statistics import cells_of
 from roadscan.tiles.tasks.cell_files import write_cells, write_overviews
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, TileTask
@@ -172,7 +173,9 @@ def _one_cell(task: TileTask) -> dict[str, tuple[bytes, str]]:
     with tempfile.TemporaryDirectory() as place:
         files = {TILE: Path(place) / "cells.parquet", OVERVIEWS: Path(place) / "overviews.parquet"}
         write_cells(files[TILE], tile.cells, task.cell_table)
-        write_overviews(files[OVERVIEWS], tile.overviews)
+        edge = task.context.grid.cells_per_edge
+        whole = dataclasses.replace(tile.cells, cells_per_edge=edge)
+        write_overviews(files[OVERVIEWS], pyramid_of(whole, overview_factors(edge)))
         for wanted in task.products:
             path = Path(place) / f"{wanted.product.name}{wanted.product.suffix_for(wanted.options)}"
             wanted.product.write(tile, wanted.options, context, path)

@@ -19,7 +19,7 @@ EXACT_INTEGER: Final = 2**53
 
 
 Ask: TypeAlias = Callable[[str], Path]
-"""Returns another document of the site by its path; it is made first if necessary."""
+"""Returns another document of the site by its path; it is made first if necessary, and is no file if that failed."""
 
 
 @dataclass(frozen=True)

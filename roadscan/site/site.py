@@ -88,7 +88,7 @@ class Published:
     """Number of files that were written; the others were current."""
     bytes: int
     failures: tuple[tuple[str, str], ...]
-    """Documents that could not be made, with reasons."""
+    """Documents that could not be made, or not whole, with reasons."""
     left_out: tuple[str, ...] = ()
     """Layers that are missing, with reasons."""
     damaged: tuple[str, ...] = ()
@@ -166,11 +166,14 @@ class _Writer:
         self.digests: dict[str, str] = {}
         self.made = self.bytes = 0
         self.failures: list[tuple[str, str]] = []
+        self._lacking: list[str] = []
+        """Documents that failed, or were not made whole, and that go into the present one."""
 
     def add(self, document: Document) -> None:
         """Reuse or write a document; one that fails is left out and reported."""
         path = self._folder / document.path
         path.parent.mkdir(parents=True, exist_ok=True)
+        self._lacking.clear()
         try:
             known = self._known.get(document.key)
             if known is not None:
@@ -182,12 +185,16 @@ class _Writer:
             path.unlink(missing_ok=True)
             self.failures.append((document.path, str(error)))
             return
-        self.keys[document.path] = document.key
+        if self._lacking:
+            self.failures.append((document.path, f"was made without {', '.join(self._lacking)}"))
+        self.keys[document.path] = "" if self._lacking else document.key  # one that lacks something is never current
         self.digests[document.path] = file_digest(path) if known is None else known.digest
         self.bytes += path.stat().st_size
 
     def _ask(self, path: str) -> Path:
         """Return an already written document: finer pictures precede coarser ones."""
+        if not self.keys.get(path):
+            self._lacking.append(path)
         return self._folder / path
 
 

@@ -35,6 +35,7 @@ PAVEMENT: Final[tuple[Raster, ...]] = ("pavement_intensity", "pavement_shaded")
 HEIGHT_STEP_M: Final = 1e-4  # unit of stored heights
 COARSER: Final = 4
 """Pixels of a coarser level along the edge of one of the next."""
+_COARSEST_PICTURES: Final = 4  # pictures of the coarsest level at the most
 _WANTED_PX: Final = 512  # largest edge of a picture
 _LEAST_PX: Final = 250  # smallest edge of a picture
 _TILES_HELD: Final = 12  # tiles in memory
@@ -65,10 +66,10 @@ class Pyramid:
     @cached_property
     def factors(self) -> tuple[int, ...]:
         """Cells along an edge of a pixel, by level: those of the tiles' overviews, and then ever four times as many,
-        until four pictures hold the survey.
+        until few pictures hold the survey.
         """
         found = [1, *overview_factors(self.grid.cells_per_edge)]
-        while len(self._lattice(found[-1])) > 4 and found[-1] * self.grid.cell_m < 1e5:
+        while len(self._lattice(found[-1])) > _COARSEST_PICTURES and found[-1] * self.grid.cell_m < 1e5:
             found.append(found[-1] * COARSER)
         return tuple(found)
 

@@ -443,6 +443,32 @@ def test_a_damaged_file_of_a_site_is_named_and_made_again(
         publish(Material(opened(survey_file)), site)
 
 
+def test_a_damaged_tile_costs_its_pictures_and_leaves_a_hole_in_coarser_ones(
+    survey_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("roadscan.site.site_rasters._COARSEST_PICTURES", 0)
+    file = tmp_path / "survey" / survey_file.name
+    shutil.copytree(survey_file.parent, file.parent)
+    store = opened(file).store
+    at = sorted(store.files("tiles/overviews"))[0]
+    sound = store.read_bytes(at)
+    store.write_bytes(at, sound[:-1])
+    site, wishes = tmp_path / "site", Wishes(clouds=False, pictures=False)
+    damaged = publish(Material(opened(file), wishes), site)
+    told = dict(damaged.failures)
+    lost = {path for path, reason in told.items() if " bytes of " in reason}
+    holed = {path for path, reason in told.items() if "was made without" in reason}
+    assert lost and holed and lost | holed == set(told)
+    assert not any((site / path).exists() for path in lost) and all((site / path).is_file() for path in holed)
+    store.write_bytes(at, sound)
+    whole = publish(Material(opened(file), wishes), site)
+    assert not whole.failures and whole.made == len(told)
+    fresh = publish(Material(opened(file), wishes), tmp_path / "fresh")
+    files = {f.relative_to(fresh.folder): f.read_bytes() for f in fresh.folder.rglob("*") if f.is_file()}
+    again = {f.relative_to(site): f.read_bytes() for f in site.rglob("*") if f.is_file()}
+    assert [str(f) for f in sorted({*files, *again}) if files.get(f) != again.get(f)] == []
+
+
 def test_a_folder_of_something_else_is_left_alone(survey_file: Path, tmp_path: Path) -> None:
     (tmp_path / "letters.txt").write_text("dear")
     done = CliRunner().invoke(app, ["publish", str(survey_file), "--out", str(tmp_path)])

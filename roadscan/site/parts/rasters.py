@@ -190,7 +190,8 @@ class Images:
             return
 
         def below(finer: Place) -> Path | None:
-            return ask(self.document(raster, finer).path) if self.pyramid.holds(finer) else None
+            file = ask(self.document(raster, finer).path) if self.pyramid.holds(finer) else None
+            return file if file is not None and file.is_file() else None  # a picture that failed leaves a hole
 
         coarser_picture(path, raster, below, place, self.pyramid.tile_px)
 

@@ -23,6 +23,7 @@ from roadscan.core.ids import TileId
 from roadscan.core.survey import CellColumns
 from roadscan.store.damage import UNREADABLE
 from roadscan.store.manifest import OutputRecord, recorded_table
+from roadscan.store.readings.byte_source import opened
 from roadscan.store.schema import table_schema
 from roadscan.store.store import MADE_AGAIN, Store
 from roadscan.tiles.cells import TileCells
@@ -111,7 +112,8 @@ def read_overview(store: Store, record: OutputRecord, factor: int) -> Level:
     """
     path = store.path(record.path)
     try:
-        with store.fs.open(path, "rb") as stream:
+        source = opened(store, record.path)
+        with source.stream as stream:
             size = stream.seek(0, os.SEEK_END)
             if record.bytes and size != record.bytes:
                 raise DamagedError(f"the file has {size} bytes of {record.bytes}", change=MADE_AGAIN, file=path)

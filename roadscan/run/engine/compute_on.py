@@ -86,5 +86,6 @@ def compute_on(
         yield Inline()
         return
     logging.getLogger("distributed").setLevel(logging.ERROR)  # a run itself reports what failed and why
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # a run that ends reconnects to no scheduler
     with contextlib.ExitStack() as stack:
         yield WhenNeeded(stack, workers, scheduler, dashboard)

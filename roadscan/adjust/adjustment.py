@@ -288,6 +288,7 @@ def _once(
     control = ControlPoints.of(chosen, each_pass=settings.mode == "each_pass")
     shared = shared if settings.mode == "joint" else ((), ())
     first = Unknowns.of(priors, control, settings.knot_spacing_s, components, shared)
+    first = replace(first, commons=int(chosen.common.max(initial=-1)) + 1)
     first.check(observations)
     priors, unknowns, rounds, alone = _without_surveys(first, chosen, settings)
     verdict = judged(*_survey_errors(unknowns, chosen, alone, rounds), settings)

@@ -52,6 +52,10 @@ CAMERA: Final = COLUMNS
 """The unknowns of a camera beside its mounting: its lens (OpenCV's parameters), what is added to the stamps of its
 pictures, and to the time between the exposures of two rows."""
 
+COMMON: Final = ("first_laser", "second_laser", "roll")
+"""Errors that ties of a lidar have in common: of the ranges of the lasers that saw their ends, and a roll that
+all ties of one drive seem to show."""
+
 FIXED: Final = -1
 """Run of an end that no correction moves: a control point, or a tie point of pictures."""
 
@@ -89,6 +93,10 @@ class Observations:
     """(n,) number of the camera whose lens and clock are estimated, −1: none."""
     camera_partials: Float64 = field(default_factory=lambda: np.zeros((0, len(CAMERA))))
     """(n, 11) derivatives by `CAMERA` of that camera."""
+    common: Int32 = field(default_factory=lambda: np.zeros((0, len(COMMON)), np.int32))
+    """(n, 3) numbers of errors that ties have in common, `COMMON`; −1: none."""
+    common_partials: Float64 = field(default_factory=lambda: np.zeros((0, len(COMMON))))
+    """(n, 3) derivatives by each of them, in units of its prior σ."""
 
     def __post_init__(self) -> None:
         if len(self.camera) != self.kind.size or len(self.camera_partials) != self.kind.size:
@@ -97,6 +105,9 @@ class Observations:
         if len(self.sensor) != self.kind.size or len(self.mount_partials) != self.kind.size:
             object.__setattr__(self, "sensor", np.full((self.kind.size, 2), -1, np.int32))
             object.__setattr__(self, "mount_partials", np.zeros((self.kind.size, 2, len(MOUNTED))))
+        if len(self.common) != self.kind.size:
+            object.__setattr__(self, "common", np.full((self.kind.size, len(COMMON)), -1, np.int32))
+            object.__setattr__(self, "common_partials", np.zeros((self.kind.size, len(COMMON))))
         if self.survey_sigma_m.size != self.kind.size:
             if self.survey_sigma_m.size:
                 raise ValueError(f"{self.survey_sigma_m.size} σ of a survey for {self.kind.size} observations")
@@ -134,8 +145,8 @@ class Observations:
         return type(self)(**{f.name: getattr(self, f.name)[which] for f in fields(self)})
 
 
-def mount_partials(in_body: Float64, arm_turns: Float64, arm_along_m: Float64, seat: Seat) -> Float64:
-    """Returns derivatives (n, 7) of the movement along a direction by the mounting of a sensor.
+def mount_partials(in_body: Float64, arm_turns: Float64, arm_along_m: Float64, seat: Seat) -> tuple[Float64, Float64]:
+    """Returns derivatives of the movement along a direction by the mounting of a sensor (n, 7), and by a range (n,).
 
     Parameters
     ----------
@@ -145,8 +156,10 @@ def mount_partials(in_body: Float64, arm_turns: Float64, arm_along_m: Float64, s
     seat : of the sensor, rows (n, 3).
     """
     arm = arm_along_m[:, None] * in_body + np.cross(in_body, arm_turns)
-    by_scale = np.einsum("ni,ni->n", in_body, seat.by_scale(arm))
-    return np.column_stack([in_body, arm_turns - np.cross(seat.lever_body_m, in_body), by_scale])
+    way = seat.by_scale(arm)
+    by_scale = np.einsum("ni,ni->n", in_body, way)
+    by_mounting = np.column_stack([in_body, arm_turns - np.cross(seat.lever_body_m, in_body), by_scale])
+    return by_mounting, by_scale / np.maximum(np.linalg.norm(way, axis=-1), 1e-3)
 
 
 def partials(direction_level: Float64, level_from_body: Float64, arm_body_m: Float64) -> Float64:

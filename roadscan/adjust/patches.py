@@ -48,8 +48,13 @@ class PassReadings:
     """(p, 3, 3) north, east, down from body axes."""
     convergence_rad: float = 0.0
     """Angle of grid north, clockwise from true north."""
-    returns: bool = False
-    """True for sparse returns of a lidar, of which planes are compared instead of cells."""
+    laser: npt.NDArray[np.uint8] | None = None
+    """(n,) of the sparse returns of a lidar, of which planes are compared instead of cells; 0 where it is not known."""
+
+    @property
+    def returns(self) -> bool:
+        """Returns whether they are those of a lidar."""
+        return self.laser is not None
 
     def __post_init__(self) -> None:
         n, p = self.pose.size, self.epoch_gps_ns.size

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import ClassVar, Literal, Self
 
@@ -66,6 +67,17 @@ class MountingPriors(Strict):
     sigma_range_scale: float = Field(default=0.0005, ge=0.0, le=0.1)
     """1 σ of the scale of ranges, as a share: makers state 0.01 to 0.1 % of the measuring range for the linearity of
     profilers."""
+    sigma_laser_m: float = Field(default=0.01, ge=0.0, le=0.1)
+    """1 σ of how far the ranges of a single laser of a lidar are off for good (m): it is the same in all ties."""
+    sigma_seeming_roll_deg: float = Field(default=0.1, ge=0.0, le=1.0)
+    """1 σ of a lasting roll that the ties of one drive of a lidar seem to show (degrees). A turn about the direction of
+    driving hardly changes how they fit, so that small errors which all of them have in common look like one. Poses are
+    not corrected by it."""
+
+    @property
+    def common_sigma(self) -> tuple[float, float]:
+        """Returns both, m and rad."""
+        return self.sigma_laser_m, math.radians(self.sigma_seeming_roll_deg)
 
 
 class TargetConfig(Strict):

@@ -2,30 +2,9 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
-import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
-from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.strict import Strict
-
-
-class Windows(NamedTuple):
-    """Times at which returns of a lidar are looked at: the beginning of each period of GPS time."""
-
-    length_ns: int
-    apart_ns: int
-    """Length of a period."""
-
-    def hold(self, epochs_gps_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-        """Returns a mask (n,) of the epochs (n,) in a window."""
-        return np.asarray(epochs_gps_ns % self.apart_ns < self.length_ns)
-
-    def meet(self, first_gps_ns: npt.NDArray[np.int64], last_gps_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-        """Returns a mask (n,) of the spans (n,) that a window has a part in."""
-        return np.asarray(self.hold(first_gps_ns) | (first_gps_ns // self.apart_ns != last_gps_ns // self.apart_ns))
 
 
 class PlaceSettings(Strict):
@@ -123,12 +102,12 @@ class TieSettings(Strict):
     """No shift is known better than this (m, 1 σ): spacing of readings, what a pose changes within a patch."""
     window_s: float = Field(default=0.2, gt=0.0)
     """Returns of a lidar that are taken together as seen from one pose (s)."""
-    windows_apart_s: float = Field(default=0.0, ge=0.0)
-    """From one of these windows to the next (s); what a lidar sees between is not read, which takes less time and knows
-    poses less well. One window follows the other where this is less than `window_s`."""
+    one_return_in: int = Field(default=3, ge=1, le=100)
+    """Of so many returns of a lidar that follow one another one is looked at. A number that shares no divisor with that
+    of the lasers takes from all of them."""
     plane_cell_m: float = Field(default=1.0, gt=0.0)
     """Edge of the cubes in which planes are sought (m)."""
-    least_returns: int = Field(default=8, ge=3)
+    least_returns: int = Field(default=6, ge=3)
     """A window sees a plane where it has so many returns on it."""
     thickest_m: float = Field(default=0.05, gt=0.0)
     """Returns of a plane scatter about it no more than this (m, 1 σ)."""
@@ -137,9 +116,3 @@ class TieSettings(Strict):
     most_planes: int = Field(default=30, ge=1)
     """Planes of a place that make ties: those with the most returns, a sixth of them for each direction (along the
     road, across and up) where there are so many."""
-
-    @property
-    def windows(self) -> Windows:
-        """Returns the times at which returns of a lidar are looked at."""
-        length = round(self.window_s * NS_PER_S)
-        return Windows(length, max(round(self.windows_apart_s * NS_PER_S), length))

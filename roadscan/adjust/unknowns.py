@@ -109,6 +109,8 @@ class Unknowns:
     control: ControlPoints
     mountings: tuple[MountingPrior, ...] = ()
     cameras: tuple[CameraPrior, ...] = ()
+    commons: int = 0
+    """Number of errors that ties have in common."""
 
     @classmethod
     def of(
@@ -147,6 +149,11 @@ class Unknowns:
     @property
     def size(self) -> int:
         """Returns the number of unknowns."""
+        return self.first_common + self.commons
+
+    @property
+    def first_common(self) -> int:
+        """Returns the first unknown of the errors that ties have in common."""
         return self.first_camera + int((self.camera_sigma > 0.0).sum())
 
     @property
@@ -249,7 +256,11 @@ class Unknowns:
         derivative[seen, -3:] = directions_of(observations)[seen] * self.control.sigma_m[point[seen]]
         mounted, by_mounting = self._of_mounted(observations)
         filmed, by_camera = self._of_filmed(observations)
-        rows = Rows.of(np.hstack([unknown, mounted, filmed]), np.hstack([derivative, by_mounting, by_camera]))
+        common = np.where(observations.common >= 0, self.first_common + observations.common, -1)
+        by_common = observations.common_partials
+        rows = Rows.of(
+            np.hstack([unknown, mounted, filmed, common]), np.hstack([derivative, by_mounting, by_camera, by_common])
+        )
         return rows, variance
 
     def _of_filmed(self, observations: Observations) -> tuple[Int64, Float64]:
@@ -277,8 +288,8 @@ class Unknowns:
     def prior_entries(self) -> tuple[Int64, Int64, Float64, Int64]:
         """Returns upper entries of the prior's inverse covariance: row, column, value, component.
 
-        Mountings, cameras and tie points of pictures have the component `len(COMPONENTS)`. Those of control points
-        are not among them: their survey is an observation, which may be wrong.
+        Mountings, cameras, what ties have in common and tie points of pictures have the component `len(COMPONENTS)`.
+        Those of control points are not among them: their survey is an observation, which may be wrong.
         """
         parts: list[tuple[Int64, Int64, Float64, Int64]] = []
         for run, prior in enumerate(self.priors):
@@ -292,7 +303,9 @@ class Unknowns:
                     value = np.concatenate([diagonal, beside])
                     parts.append((row, column, value, np.full(row.size, component, np.int64)))
         parts.append(self._of_mounting_priors())
-        free = np.concatenate([self.of_control[self.control.free].ravel(), self.of_cameras[self.of_cameras >= 0]])
+        commons = np.arange(self.first_common, self.size)
+        points = self.of_control[self.control.free].ravel()
+        free = np.concatenate([points, self.of_cameras[self.of_cameras >= 0], commons])
         parts.append((free, free, np.ones(free.size), np.full(free.size, _SIZE, np.int64)))
         rows, columns, values, components = zip(*parts, strict=True)
         return np.concatenate(rows), np.concatenate(columns), np.concatenate(values), np.concatenate(components)

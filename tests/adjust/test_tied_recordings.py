@@ -166,7 +166,7 @@ def drive_ties(drive: KittiDrive) -> Ties:
         (near,) = np.nonzero(away < place.radius_m)
         readings = PassReadings(
             0, "velodyne", *drive.place_m[near].T, np.zeros(near.size, np.uint16), pose[near], epochs,
-            drive.position_m, level, returns=True,
+            drive.position_m, level, laser=np.zeros(near.size, np.uint8),
         )  # fmt: skip
         parts.append(ties_at(place, [readings], TieSettings()))
     return Ties.joined(parts)

@@ -301,7 +301,7 @@ def observations_of(sightings: Sequence[Sighting], seen_by: Sequence[SeenBy] | N
     along = np.einsum("ni,ni->n", in_body, np.array([one.arm_body_m for one in seen]))
     seat = Seat(np.array([s.seat.lever_body_m for s in each]), np.array([s.seat.beam_body for s in each]))
     by_mounting = np.zeros((joined.size, 2, len(MOUNTED)))
-    by_mounting[:, 0] = mount_partials(in_body, joined.partials[:, 0, 3:], along, seat)
+    by_mounting[:, 0] = mount_partials(in_body, joined.partials[:, 0, 3:], along, seat)[0]
     sensor = np.array([[s.number, -1] for s in each], np.int32)
     return replace(joined, sensor=sensor, mount_partials=by_mounting)
 

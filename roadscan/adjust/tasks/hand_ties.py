@@ -270,7 +270,7 @@ def _observations(
         derivatives[:, side] = sign * partials(direction, axes, np.broadcast_to(one.arm_body_m, (n, 3)))
         seat = mounted.seats(runs[one.run], one.sensor, np.full(n, one.epoch_gps_ns, np.int64))
         in_body = sign * direction @ one.level_from_body
-        mounts[:, side] = mount_partials(in_body, derivatives[:, side, 3:], in_body @ one.arm_body_m, seat)
+        mounts[:, side] = mount_partials(in_body, derivatives[:, side, 3:], in_body @ one.arm_body_m, seat)[0]
     return Observations(
         np.full(n, KINDS.index(_KIND), np.uint8), np.tile(np.array([one.run for one in pair], np.int32), (n, 1)),
         np.tile(np.array([one.epoch_gps_ns for one in pair], np.int64), (n, 1)), derivatives, np.array(values),

@@ -72,6 +72,8 @@ class Mounted:
     """Run and sensor of heads whose beams are all parallel to their z axis."""
     cameras: frozenset[str] = frozenset()
     """Names of cameras: pictures show their mounting whether or not it contradicts what was stated."""
+    common_sigma: tuple[float, float] = (0.0, 0.0)
+    """1 σ of how far the ranges of single lasers are off (m), and of a roll that ties of a drive seem to show (rad)."""
 
     def number(self, run: str, sensor: str) -> int:
         """Returns the index of a run's sensor in `priors`, −1: not estimated."""
@@ -109,7 +111,7 @@ def mounted_of(plan: SurveyPlan, sources: Sources, *, foreign: bool) -> Mounted:
     stated = {(source.run, source.sensor): source.mountings for source, _ in sources}
     parallel = frozenset((source.run, source.sensor) for source, _ in sources if source.has_parallel_beams)
     if foreign or config.mode != "joint":
-        return Mounted((), stated, parallel)
+        return Mounted((), stated, parallel, common_sigma=config.mountings.common_sigma)
     calibrated = calibrated_sigma(plan.store)
     priors = []
     # A fixed run is right as it is, and so are the mountings of its sensors.
@@ -121,7 +123,8 @@ def mounted_of(plan: SurveyPlan, sources: Sources, *, foreign: bool) -> Mounted:
     cameras = [
         MountingPrior(name, camera_sigma(one, config.cameras)[0]) for name, one in adjusted_cameras(plan.survey).items()
     ]
-    return Mounted((*priors, *cameras), stated, parallel, frozenset(one.sensor for one in cameras))
+    filmed = frozenset(one.sensor for one in cameras)
+    return Mounted((*priors, *cameras), stated, parallel, filmed, config.mountings.common_sigma)
 
 
 def _sigma(plan: SurveyPlan, config: AdjustConfig, sensor: str, calibrated: Float64 | None) -> Float64:

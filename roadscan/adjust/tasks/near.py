@@ -13,7 +13,6 @@ import pyarrow as pa
 
 from roadscan.adjust.patches import PassReadings
 from roadscan.adjust.places import Traverse
-from roadscan.adjust.tie_settings import Windows
 from roadscan.core.grid import QUANTA_PER_M
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.georeference.place import EIGHT_TO_SIXTEEN_BITS, EVERYWHERE, Placement
@@ -34,6 +33,10 @@ _AT_ONCE: Final = 64
 """Readings of profiles are cut off by so many."""
 _BESIDE_M: Final = 0.2
 """Other profiles see the place with readings so much farther to the side (m)."""
+_OF_RETURNS: Final = [
+    "epoch_gps_ns", "pose_epoch_gps_ns", "x_sensor_m", "y_sensor_m", "z_sensor_m", "intensity", "laser",
+]  # fmt: skip
+"""Columns of the returns of a lidar that are read."""
 _KEPT_GROUPS: Final = 8
 """Row groups of profiles cached, as they are stored."""
 _KEPT_RETURNS: Final = 6_000_000
@@ -63,14 +66,11 @@ class NearFile:
         source: ReadingSource,
         file: DataFile,
         spans_gps_ns: Sequence[tuple[int, int]],
-        windows: Windows | None = None,
     ) -> NearFile | None:
-        """Returns the row groups with readings of some spans; None where there are none. windows : of returns."""
+        """Returns the row groups with readings of some spans; None where there are none."""
         own = np.array(source.spans(file.group_spans), np.int64).reshape(-1, 2)
         wanted = np.array(spans_gps_ns, np.int64).reshape(-1, 1, 2)
         inside = ((own[:, 0] <= wanted[:, :, 1]) & (own[:, 1] >= wanted[:, :, 0])).any(axis=0)
-        if windows is not None and source.table == "returns":
-            inside &= windows.meet(*own.T)
         near = np.flatnonzero(inside)
         if not near.size:
             return None
@@ -88,18 +88,13 @@ class NearFile:
         return [self.source.key, *road, self.digest, list(self.groups)]
 
 
-def near_files(
-    sources: Sources, traverses: Iterable[Traverse], runs: Sequence[str], windows: Windows | None = None
-) -> list[NearFile]:
-    """Returns row groups of all sources with readings of some traverses, which number the runs as in `runs`.
-
-    windows : of the returns of lidars; None where all are wanted.
-    """
+def near_files(sources: Sources, traverses: Iterable[Traverse], runs: Sequence[str]) -> list[NearFile]:
+    """Returns row groups of all sources with readings of some traverses, which number the runs as in `runs`."""
     spans: dict[tuple[str, str], list[tuple[int, int]]] = {}
     for one in traverses:
         spans.setdefault((runs[one.run], one.sensor), []).append((one.first_gps_ns, one.last_gps_ns))
     found = [
-        NearFile.of(source, file, wanted, windows)
+        NearFile.of(source, file, wanted)
         for source, files in sources
         if (wanted := spans.get((source.run, source.sensor)))
         for file in files
@@ -139,11 +134,11 @@ class NearReader:
         files: Sequence[NearFile],
         runs: Sequence[str],
         apart_m: float = 0.0,
-        windows: Windows | None = None,
+        one_return_in: int = 1,
     ) -> None:
         """`runs` : all runs of the survey, in the order by which traverses number them.
 
-        apart_m : profiles are thinned to at most this spacing. windows : of the returns of lidars, as in `files`.
+        apart_m : profiles are thinned to at most this spacing. one_return_in : of so many of a lidar one is placed.
         """
         self._store, self._frame, self._runs = store, ground.map, runs
         self._placer = Georeferencer(store, ground, [one.slice for one in files], recorded=True)
@@ -151,8 +146,9 @@ class NearReader:
         for one in files:
             self._files.setdefault((one.source.run, one.source.sensor), []).append(one)
         self._kept: dict[tuple[str, int], pa.RecordBatch] = {}
-        self._apart_m, self._windows = apart_m, windows
+        self._apart_m, self._one_return_in = apart_m, one_return_in
         self._returns: dict[tuple[str, int], PlacedReadings] = {}
+        self._held = 0
 
     def of(self, traverse: Traverse, circle: Circle) -> PassReadings:
         """Returns readings of one traverse within a circle."""
@@ -187,13 +183,15 @@ class NearReader:
         """Returns lidar returns of a row group; each is a separate row."""
         known = self._returns.get((file.path, group))
         if known is None:
-            batch = read_rows(self._store, file.source, file.path, [group]).combine_chunks().to_batches()[0]
-            if self._windows is not None:
-                batch = _taken(batch, np.flatnonzero(self._windows.hold(batch.column("epoch_gps_ns").to_numpy())))
+            columns = _OF_RETURNS
+            batch = read_rows(self._store, file.source, file.path, [group], columns).combine_chunks().to_batches()[0]
+            if self._one_return_in > 1:
+                batch = batch.take(np.arange(0, batch.num_rows, self._one_return_in))
             known = placed_readings(batch, None, self._placer.placement(file.source))
             self._returns[file.path, group] = known
-            while len(self._returns) > 1 and sum(len(one.points_m) for one in self._returns.values()) > _KEPT_RETURNS:
-                self._returns.pop(next(iter(self._returns)))
+            self._held += len(known.points_m)
+            while len(self._returns) > 1 and self._held > _KEPT_RETURNS:
+                self._held -= len(self._returns.pop(next(iter(self._returns))).points_m)
         return known
 
     def _profiles(self, file: NearFile, group: int, span: tuple[int, int]) -> pa.RecordBatch | None:
@@ -252,7 +250,7 @@ class NearReader:
             body_m=poses.body_m,
             level_from_body=poses.level_from_body,
             convergence_rad=turned,
-            returns=bool(files) and files[0].source.table == "returns",
+            laser=found.laser,
         )
 
 
@@ -268,12 +266,17 @@ class PlacedReadings:
     """(n,) profile of each."""
     epoch_gps_ns: Int64
     """(r,)"""
+    laser: npt.NDArray[np.uint8] | None = None
+    """(n,) of the returns of a lidar, 0 where the log does not say."""
 
     def chosen(self, which: npt.NDArray[np.bool_]) -> PlacedReadings:
         """Returns a subset; of lidar returns also the rows, which are one each."""
-        points, intensity, row = self.points_m[which], self.intensity[which], self.row[which]
-        if len(which) == self.epoch_gps_ns.size and len(row) < len(which):
-            return PlacedReadings(points, intensity, np.arange(row.size), self.epoch_gps_ns[row])
+        if which.all():
+            return self
+        rows = np.flatnonzero(which)
+        points, intensity, row = self.points_m[rows], self.intensity[rows], self.row[rows]
+        if self.laser is not None:
+            return PlacedReadings(points, intensity, np.arange(row.size), self.epoch_gps_ns[row], self.laser[rows])
         return PlacedReadings(points, intensity, row, self.epoch_gps_ns)
 
     @classmethod
@@ -287,17 +290,20 @@ class PlacedReadings:
             np.concatenate([p.intensity for p in parts]),
             np.concatenate([p.row + start for p, start in zip(parts, first, strict=True)]),
             np.concatenate([p.epoch_gps_ns for p in parts]),
+            None if any(p.laser is None for p in parts) else np.concatenate([p.laser for p in parts]),
         )
 
 
 def placed_readings(batch: pa.RecordBatch, geometry: ScanGeometry | None, placement: Placement) -> PlacedReadings:
     """Returns readings from rows of a source's table that no filter leaves out; geometry : of scans."""
     if geometry is None:
-        placed = placement.returns(batch, EVERYWHERE)
+        placed = placement.located(batch, None, EVERYWHERE)
         corner = placed.tiles.astype(np.int64) * placement.tile_quanta
         east, north = ((corner[:, k] + placed.quanta[:, k]) / QUANTA_PER_M for k in (0, 1))
         points = np.stack([east, north, placed.quanta[:, 2] / QUANTA_PER_M], axis=-1)
-        return PlacedReadings(points, placed.intensity, np.arange(len(points)), placed.epoch_gps_ns)
+        names = "epoch_gps_ns", "intensity", "laser"
+        epoch, intensity, laser = (batch.column(name).to_numpy()[placed.row] for name in names)
+        return PlacedReadings(points, intensity, np.arange(len(points)), epoch, laser)
     profiles = placement.by_profile(batch, geometry)
     kept = np.flatnonzero(profiles.kept.ravel())
     columns = [profiles.easting_m, profiles.northing_m, profiles.height_m]

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from roadscan.adjust.observations import KINDS, Observations, mount_partials
+from roadscan.adjust.observations import COMMON, KINDS, MOUNTED, Observations, mount_partials
 from roadscan.adjust.patches import PassReadings, Shift, shifted
 from roadscan.adjust.places import Place, Traverse
 from roadscan.adjust.tasks.mountings import Mounted
@@ -37,6 +37,8 @@ TIES: Final = "ties"
 
 _PLACES: Final = 50
 """Places of a task: a quarter of a kilometre of one road at the usual spacing."""
+_LASERS: Final = 256
+"""Lasers of a sensor are numbered by bytes."""
 _SEAM_CELLS: Final = 40
 """Least number of cells that both heads saw at a seam: a strip that is one cell wide has 160 along 4 m."""
 _SEAM_ASIDE_M: Final = 0.25
@@ -102,7 +104,7 @@ def tie_tasks(
     tasks = []
     for start in range(0, len(places), _PLACES):
         own, moved = tuple(places[start : start + _PLACES]), tuple(shifts[start : start + _PLACES])
-        files = tuple(near_files(sources, [t for place in own for t in place.traverses], runs, settings.windows))
+        files = tuple(near_files(sources, [t for place in own for t in place.traverses], runs))
         seen = [one.key(road_key(one.source)) for one in files]
         key = key_of(shaping, [asdict(place) for place in own], seen, *([number, moved] if number else []))
         tasks.append(TieTask(plan.store, plan.ground, settings, runs, own, files, key, number, moved))
@@ -111,8 +113,8 @@ def tie_tasks(
 
 def collect_ties(task: TieTask) -> OutputRecord:
     """Compare the passes at some places and write the ties (runs on a worker)."""
-    apart_m, windows = _APART * task.settings.shift_cell_m, task.settings.windows
-    reader = NearReader(task.store, task.ground, task.files, task.runs, apart_m, windows)
+    apart_m, one_in = _APART * task.settings.shift_cell_m, task.settings.one_return_in
+    reader = NearReader(task.store, task.ground, task.files, task.runs, apart_m, one_in)
     moves = zip(task.places, task.shifts_m or [None] * len(task.places), strict=True)
     found = Ties.joined([ties_of(reader, place, task.settings, shifts) for place, shifts in moves])
     if not found.observations.size:
@@ -180,8 +182,8 @@ def _by_mounting(
     end: str,
     geometry: tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]],
     mounted: Mounted,
-) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float64]]:
-    """Returns the number (n,) of the sensor of one end, and derivatives (n, 7) by its mounting.
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Returns the number (n,) of the sensor of one end, and derivatives by its mounting (n, 7) and by a range (n,).
 
     geometry : derivatives by a shift and by a turn of the pose, body axes, the arm along the direction, and epochs.
     """
@@ -194,7 +196,33 @@ def _by_mounting(
         number[own] = mounted.number(run, sensor)
         one = mounted.seats(run, sensor, epochs[own])
         seat.lever_body_m[own], seat.beam_body[own] = one.lever_body_m, one.beam_body
-    return number, mount_partials(shifts, turns, along, seat)
+    return number, *mount_partials(shifts, turns, along, seat)
+
+
+def _common(
+    column: Mapping[str, npt.NDArray[Any]],
+    run: npt.NDArray[np.int32],
+    partials: Sequence[npt.NDArray[np.float64]],
+    mounted: Mounted,
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float64]]:
+    """Returns numbers (n, 3) of the errors that ties have in common, and derivatives by these.
+
+    partials : by the mounting (n, 2, 7), and by a range (n, 2), of each end.
+    """
+    laser_sigma_m, roll_sigma_rad = mounted.common_sigma
+    sensors = sorted({sensor for _, sensor in mounted.stated})
+    number = np.full((len(run), len(COMMON)), -1, np.int32)
+    for k, end in enumerate(("first", "second")):
+        of_sensor = np.searchsorted(sensors, column[f"{end}_sensor"].astype(str))
+        laser = column[f"{end}_laser"].astype(np.float64)
+        seen = np.isfinite(laser)
+        number[seen, k] = _LASERS * of_sensor[seen] + laser[seen].astype(np.int32)
+    within = (number[:, 1] >= 0) & (run[:, 0] == run[:, 1])
+    number[within, 2] = _LASERS * len(sensors) + run[within, 0]
+    by_mounting, by_range = partials
+    by_roll = by_mounting[:, :, MOUNTED.index("roll_rad")].sum(axis=1)
+    found = np.column_stack([laser_sigma_m * by_range, roll_sigma_rad * by_roll])
+    return np.where(found != 0.0, number, -1), found
 
 
 @dataclass(frozen=True)
@@ -276,11 +304,15 @@ def load_ties(
         _by_mounting(column, e, (shifts[:, k], turns[:, k], column[_ARMS[k]], epochs[:, k]), mounted)
         for k, e in enumerate(ends)
     ]
+    of_run = np.array([[number[run] for run in column[f"{e}_run"]] for e in ends], np.int32).T.reshape(-1, 2)
+    by_mounting = np.stack([by for _, by, _ in mounts], axis=1)
+    by_range = np.stack([by for _, _, by in mounts], axis=1)
+    common, by_common = _common(column, of_run, (by_mounting, by_range), mounted)
     observations = Observations(
-        np.array([KINDS.index(kind) for kind in column["kind"]], np.uint8),
-        np.array([[number[run] for run in column[f"{e}_run"]] for e in ends], np.int32).T.reshape(-1, 2),
+        np.array([KINDS.index(kind) for kind in column["kind"]], np.uint8), of_run,
         epochs, partials, column["value_m"], column["sigma_m"], group.astype(np.int64), column["place"],
-        sensor=np.stack([sensor for sensor, _ in mounts], axis=-1),
-        mount_partials=np.stack([by for _, by in mounts], axis=1),
+        sensor=np.stack([sensor for sensor, _, _ in mounts], axis=-1),
+        mount_partials=by_mounting,
+        common=common, common_partials=by_common,
     )  # fmt: skip
     return KnownTies(observations, column, tried)

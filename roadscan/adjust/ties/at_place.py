@@ -76,7 +76,9 @@ def ties_at(place: Place, readings: Sequence[PassReadings], settings: TieSetting
     for number, (a, b) in enumerate(pairs_of(len(pictures.patches))):
         found += [replace(tie, group=_GROUPS * number + tie.group) for tie in _of_pair(pictures, a, b)]
     planes = plane_ties(place, [one for one in readings if one.returns], settings)
-    above = 1 + max((tie.group for tie in found), default=0)
+    if not found:
+        return as_ties(place, planes)
+    above = 1 + max(tie.group for tie in found)
     return as_ties(place, [*shared(found), *(replace(tie, group=above + tie.group) for tie in planes)])
 
 
@@ -172,6 +174,7 @@ def _columns(
         "direction_down": direction[:, 2],
         "value_m": observations.observed_m,
         "sigma_m": observations.sigma_m,
+        **{f"{end}_laser": np.array([t.ends[k].laser for t in found]) for k, end in enumerate(("first", "second"))},
         "count": np.array([t.count for t in found], np.int32),
         "correlation": np.array([t.correlation for t in found], np.float64),
         "accepted": np.array([t.counts for t in found], np.uint8),

@@ -1,7 +1,8 @@
 """Lidar ties: planes of the ground, of kerbs' faces and of walls in time windows, of one pass or of several.
 
 Returns of a lidar are too sparse for pictures. In a cube, all windows together know how a plane lies, each window how
-far along the plane's normal (point to plane; Chen and Medioni 1992). The normal is that of the returns about the mean
+far along the plane's normal (point to plane; Chen and Medioni 1992). What a window tells is what one laser saw: how far
+its ranges are off for good is an unknown of the adjustment. The normal is that of the returns about the mean
 of their own window, so windows that lie apart do not bend it.
 """
 
@@ -9,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -20,6 +21,7 @@ from roadscan.adjust.patches import PassReadings, level_from_map
 from roadscan.adjust.places import Place
 from roadscan.adjust.tie_settings import TieSettings
 from roadscan.adjust.ties.tie import COUNTS, PLANE, TOO_FAR, End, Tie
+from roadscan.core.gpstime import NS_PER_S
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
@@ -35,6 +37,8 @@ _FIRST: Final = (0, 0, 0, 1, 1, 2)  # Rows of the six products of a symmetric 3 
 _SECOND: Final = (0, 1, 2, 1, 2, 2)  # … and their columns.
 _SHARE: Final = 6
 """One in this many planes is kept for each direction, if there are that many."""
+_LASERS: Final = 256
+"""Lasers are numbered by bytes."""
 _SPARSE: Final = 16
 """Numbers are looked up in a table where their range is no larger than this many times their count."""
 
@@ -47,6 +51,8 @@ class _Returns:
     """(n, 3) from the place, map axes."""
     pose: Int64
     """(n,) row in the poses of its traverse."""
+    laser: Int64
+    """(n,)"""
     window: Int64
     """(n,) number of its window, by traverse and time."""
     traverse: Int64
@@ -70,11 +76,39 @@ class _Planes:
     thickness_m: Float64
     """(c,)"""
     tilt: Float64
-    """(c,) variance of the plane's tilt (rad²), the worse axis."""
+    """(c,) variance of the plane's tilt (rad²), the worse axis, where it is a metre thick."""
+    of_return: Int64
+    """(n,) window of each return, −1: none."""
+    laser: Int64
+    """(g,) that saw it, −1: several."""
+
+    def by_laser(self, near: _Returns, cubes: Sequence[int], least: int) -> _Planes:
+        """Returns the windows of some cubes, each with the mean of the laser that has the most returns in it."""
+        rank = np.where(np.isin(self.cube, cubes), np.cumsum(np.isin(self.cube, cubes)) - 1, -1)
+        rows = np.flatnonzero(self.of_return >= 0)
+        rows = rows[rank[self.of_return[rows]] >= 0]
+        window, size = rank[self.of_return[rows]], int(rank.max(initial=-1)) + 1
+        counts = np.bincount(window * _LASERS + near.laser[rows], minlength=size * _LASERS).reshape(size, _LASERS)
+        laser = counts.argmax(axis=1)
+        own = near.laser[rows] == laser[window]
+        rows, window = rows[own], window[own]
+        count = np.bincount(window, minlength=size)
+        values = (*near.point_m[rows].T, near.pose[rows])
+        east, north, up, pose = (np.bincount(window, v, size) / np.maximum(count, 1) for v in values)
+        old, kept, mean = np.flatnonzero(rank >= 0), count >= least, np.stack([east, north, up], axis=-1)
+        cube = self.cube[old]
+        away = np.einsum("ni,ni->n", near.point_m[rows] - mean[window], self.normal[cube[window]])
+        spread = np.bincount(cube[window], away**2, self.thickness_m.size)
+        free = np.bincount(cube, count - 1, self.thickness_m.size) - 2.0  # of the plane's own tilt
+        thickness = np.sqrt(np.maximum(spread / np.maximum(free, 1), _LEAST_VARIANCE_M2))
+        return replace(
+            self, cube=cube[kept], mean_m=mean[kept], count=count[kept], thickness_m=thickness,
+            traverse=self.traverse[old[kept]], pose=np.rint(pose[kept]).astype(np.int64), laser=laser[kept],
+        )  # fmt: skip
 
 
 def plane_ties(place: Place, readings: Sequence[PassReadings], settings: TieSettings) -> list[Tie]:
-    """Returns ties along the normals of planes between the windows of `settings.windows`, those of a cube in a ring.
+    """Returns ties along the normals of planes between windows of `settings.window_s`, those of a cube in a ring.
 
     Redundant ties have larger σ: q ties of m windows have m − 1 independent values.
     """
@@ -82,25 +116,27 @@ def plane_ties(place: Place, readings: Sequence[PassReadings], settings: TieSett
     if near is None or near.pose.size == 0:
         return []
     planes = _planes(near, settings)
-    first, second, weaker = _pairs(planes, _chosen(place, planes, settings.most_planes))
+    cubes = _chosen(place, planes, settings.most_planes)
+    planes = planes.by_laser(near, cubes, settings.least_returns)
+    first, second, weaker = _pairs(planes, cubes)
     return _ties(place, readings, planes, (first, second), weaker, settings)
 
 
 def _near(place: Place, readings: Sequence[PassReadings], settings: TieSettings) -> _Returns:
     """Returns the lidar returns within the square of a place."""
-    chosen = settings.windows
-    parts: list[tuple[Float64, Int64, Int64]] = []
+    length = round(settings.window_s * NS_PER_S)
+    parts: list[tuple[Float64, Int64, Int64, Int64]] = []
     traverse: list[int] = []
     for number, one in enumerate(readings):
-        windows, of_pose = np.unique(one.epoch_gps_ns // chosen.apart_ns, return_inverse=True)
+        windows, of_pose = np.unique(one.epoch_gps_ns // length, return_inverse=True)
         point = np.stack([one.easting_m - place.easting_m, one.northing_m - place.northing_m, one.height_m], axis=-1)
         near = (np.abs(point[:, :2]) <= place.radius_m).all(axis=1) & np.isfinite(point[:, 2])
-        inside = np.flatnonzero(near & chosen.hold(one.epoch_gps_ns)[one.pose])
-        pose = one.pose[inside].astype(np.int64)
-        parts.append((point[inside], pose, len(traverse) + of_pose[pose]))
+        inside = np.flatnonzero(near)
+        pose, laser = one.pose[inside].astype(np.int64), np.asarray(one.laser)[inside].astype(np.int64)
+        parts.append((point[inside], pose, laser, len(traverse) + of_pose[pose]))
         traverse += [number] * windows.size
-    points, poses, numbers = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return _Returns(points, poses, numbers, np.array(traverse, np.int64))
+    points, poses, lasers, numbers = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return _Returns(points, poses, lasers, numbers, np.array(traverse, np.int64))
 
 
 def _planes(near: _Returns, settings: TieSettings) -> _Planes:
@@ -125,10 +161,12 @@ def _planes(near: _Returns, settings: TieSettings) -> _Planes:
     used = flat[cube_of] & (windows.count >= least)
     used &= np.bincount(cube_of[used], minlength=cubes.size)[cube_of] > 1
     pose = np.bincount(group[kept], near.pose[kept], keys.size) / np.maximum(windows.count, 1)
-    tilt = values[:, 0] / (np.maximum(number, 1) * values[:, 1])
+    tilt = 1.0 / (np.maximum(number, 1) * values[:, 1])
+    rank = np.where(used, np.cumsum(used) - 1, -1)
     return _Planes(
         cube_of[used], (windows.mean_m + middle)[used], windows.count[used], near.traverse[window_of[used]],
         np.rint(pose[used]).astype(np.int64), normal, np.sqrt(values[:, 0]), tilt,
+        np.where(kept, rank[group], -1), np.full(int(used.sum()), -1),
     )  # fmt: skip
 
 
@@ -204,6 +242,8 @@ def _pairs(planes: _Planes, cubes: Sequence[int]) -> tuple[Int64, Int64, Float64
     pairs, weaker = [np.zeros((0, 2), np.int64)], [np.zeros(0)]
     for cube in cubes:
         windows = np.flatnonzero(planes.cube == cube)
+        if windows.size < 2:
+            continue
         half = windows.size // 2
         steps = (1, half) if half > 1 else (1,)
         own = np.concatenate([np.stack([windows[:-step], windows[step:]], axis=-1) for step in steps])
@@ -228,12 +268,14 @@ def _ties(
     between = planes.mean_m[b] - planes.mean_m[a]
     value = np.einsum("ni,ni->n", normal, between)
     lateral2 = np.maximum(np.einsum("ni,ni->n", between, between) - value**2, 0.0)
-    noise = planes.thickness_m[cube] ** 2 * (1.0 / planes.count[a] + 1.0 / planes.count[b])
-    sigma = weaker * np.sqrt(noise + lateral2 * planes.tilt[cube] + 2.0 * settings.uneven_m**2)
+    noise = 1.0 / planes.count[a] + 1.0 / planes.count[b] + lateral2 * planes.tilt[cube]
+    sigma = weaker * np.sqrt(planes.thickness_m[cube] ** 2 * noise + 2.0 * settings.uneven_m**2)
     mean = planes.mean_m + np.array([place.easting_m, place.northing_m, 0.0])
     ends = [
-        End(readings[traverse], pose, point)
-        for traverse, pose, point in zip(planes.traverse.tolist(), planes.pose.tolist(), mean, strict=True)
+        End(readings[traverse], pose, point, laser)
+        for traverse, pose, point, laser in zip(
+            planes.traverse.tolist(), planes.pose.tolist(), mean, planes.laser.tolist(), strict=True
+        )
     ]
     direction = np.empty((a.size, 3))
     for traverse, one in enumerate(readings):

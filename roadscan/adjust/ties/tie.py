@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -34,6 +35,8 @@ class End:
     """Row of the pose."""
     point_m: Float64
     """(3,) easting, northing, height as the recorded pose places it."""
+    laser: float = math.nan
+    """Laser that saw it; NaN of a sensor that has none."""
 
 
 @dataclass(frozen=True)

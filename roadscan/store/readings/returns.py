@@ -5,7 +5,7 @@ Files with roadscan's pages are decoded by `codecs/parquet`; those of other writ
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -22,6 +22,7 @@ from roadscan.store.store import Store
 
 _EPOCH, _POSE_EPOCH = "epoch_gps_ns", "pose_epoch_gps_ns"
 _LASER, _SWEEP = "laser", "sweep"
+_MORE_KINDS: Final = {_LASER: np.uint8, _SWEEP: np.int32}
 _KINDS: Final[dict[str, np.dtype[Any]]] = {
     _EPOCH: np.dtype(np.int64), _POSE_EPOCH: np.dtype(np.int64),
     "x_sensor_m": np.dtype(np.float32), "y_sensor_m": np.dtype(np.float32), "z_sensor_m": np.dtype(np.float32),
@@ -62,9 +63,9 @@ class ReturnsReader(GroupReader[Returns, NumberFile]):
     what = "returns"
     columns = _COLUMNS
 
-    def __init__(self, store: Store, file: str, footer: Footer | None = None, *, whole: bool = False) -> None:
-        """`footer` : the file, where it is open; whole : lasers and sweeps of packed returns are read, too."""
-        self._whole = whole
+    def __init__(self, store: Store, file: str, footer: Footer | None = None, *, more: Set[str] = frozenset()) -> None:
+        """`footer` : the file, where it is open; more : whether `laser` and `sweep` of packed returns are read, too."""
+        self._more = more
         self._arrays = {name: np.empty(0, kind) for name, kind in _KINDS.items()}
         self._distance = np.empty(0, np.uint16)
         self._beams: Beams | None = None
@@ -74,7 +75,7 @@ class ReturnsReader(GroupReader[Returns, NumberFile]):
     def _suits(self, schema: pa.Schema) -> bool:
         if is_packed(schema.names):
             self._beams = Beams.of(self._metadata.metadata)
-            self.columns = [*_PACKED_KINDS, *([_SWEEP] if self._whole else [])]
+            self.columns = [*_PACKED_KINDS, *([_SWEEP] if _SWEEP in self._more else [])]
         missing = set(self.columns).difference(schema.names)
         if missing:
             raise DamageError(f"it has no column '{min(missing)}'")
@@ -116,8 +117,7 @@ class ReturnsReader(GroupReader[Returns, NumberFile]):
             self._distance = np.empty(total, np.uint16)
         columns = {name: values[:total] for name, values in self._arrays.items()}
         columns[_POSE_EPOCH] = columns[_EPOCH]
-        if self._whole:
-            columns |= {_LASER: np.empty(total, np.uint8), _SWEEP: np.empty(total, np.int32)}
+        columns |= {name: np.empty(total, kind) for name, kind in _MORE_KINDS.items() if name in self._more}
         for group, n in zip(groups, rows, strict=True):
             packed.load(group, self.columns)
             own = slice(first, first + n)
@@ -129,12 +129,13 @@ class ReturnsReader(GroupReader[Returns, NumberFile]):
             slot = packed.bytes("slot", n)
             polar = Packed(head, head_end, rate, rate_end, self._distance[:n], slot)
             beams.places(polar, [columns[f"{axis}_sensor_m"][own] for axis in "xyz"])
-            if self._whole:
+            if _LASER in self._more:
                 columns[_LASER][own] = beams.lasers[slot]
+            if _SWEEP in self._more:
                 end, sweep = packed.runs(_SWEEP, n, columns[_SWEEP].dtype)
                 columns[_SWEEP][own] = np.repeat(sweep, np.diff(end, prepend=0))
             first += n
-        return Returns(*columns.values())
+        return Returns(**columns)
 
     def _from_table(self, rows: pa.Table) -> Returns:
         rows = as_returns(rows, _COLUMNS)

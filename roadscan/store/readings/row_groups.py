@@ -59,8 +59,8 @@ def _decoded(store: Store, file: str, footer: Footer, groups: Sequence[int], sch
     if "x_sensor_m" in schema.names:
         from roadscan.store.readings.returns import ReturnsReader
 
-        whole = not {"laser", "sweep"}.isdisjoint(schema.names)
-        returns = vars(ReturnsReader(store, file, footer, whole=whole).read(groups))
+        more = {"laser", "sweep"}.intersection(schema.names)
+        returns = vars(ReturnsReader(store, file, footer, more=more).read(groups))
         return {
             name: pa.array(values) for name, values in returns.items() if name in schema.names and values is not None
         }

@@ -12,7 +12,7 @@ from benchmarks.judged_scenes import PERSON, UNKNOWN, VEHICLE, JudgedScene, judg
 from benchmarks.judgement import Segments
 from roadscan.assets import classes
 from roadscan.assets.cubes import cubes_of
-from roadscan.assets.moving import CELL_M, LEVEL_M, TALL, columns_of, moving_cells
+from roadscan.assets.moving import CELL_M, LEVEL_M, TALL, columns_of, driven_cells, moving_cells
 from roadscan.assets.road_users import Bodies, groups_of
 
 FIT: Final[dict[str, Any]] = {
@@ -43,7 +43,8 @@ def of_scene(one: JudgedScene) -> Segments:
     above = ~on_ground & (scene.above_ground_m > 0.1)
     held = columns_of(returns, scene.above_ground_m, on_ground, scene.extent)
     cubes = cubes_of(returns, scene.above_ground_m, above, scene.extent)
-    groups = groups_of(held, moving_cells(held), Bodies(returns, scene.above_ground_m, on_ground, cubes))
+    moving = moving_cells(held) | driven_cells(held, scene.drive_xyh_m)
+    groups = groups_of(held, moving, Bodies(returns, scene.above_ground_m, on_ground, cubes))
     column, row = (np.floor((v - o) / CELL_M).astype(int) for v, o in
                    zip((returns.x_m, returns.y_m), held.grid.origin, strict=True))  # fmt: skip
     inside = above & (scene.above_ground_m > _LOW_M) & (scene.above_ground_m < TALL * LEVEL_M)

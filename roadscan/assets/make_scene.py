@@ -63,7 +63,7 @@ def make_scene(
     above = ~ground.on_ground & (ground.above_m > _ABOVE_M)
     extent = extent_of(wider, returns)
     cubes = cubes_of(returns, ground.above_m, above, extent)
-    users = road_users(returns, ground.above_m, ground.on_ground, cubes, extent)
+    users = road_users(returns, ground.above_m, ground.on_ground, cubes, extent, drive)
     found[users.vehicle] = classes.VEHICLE
     found[users.person] = classes.PERSON
     found = surroundings(returns, ground.above_m, found, cubes, extent, drive)

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from roadscan.assets.ground.grid import Grid, grid_over
 from roadscan.assets.kernels import columns
+from roadscan.assets.kernels.corridors import mark_corridor
 from roadscan.assets.quantiles import quantiles
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
@@ -41,6 +42,9 @@ TALLEST: Final = 21
 _LEAST_CELLS: Final = 6  # Smaller groups of cells are no vehicle or person.
 _STAYS_SLOTS: Final = 8
 """What is seen in this many slots, and in more than twice as many as the ground without it, is stationary."""
+_DRIVEN_M: Final = 0.7  # Half the width of the narrowest cars (m).
+_DRIVEN_LEVELS: Final = 0b1111000
+"""Levels at which a car meets what stands in its way, as bits: 0.6–1.4 m. Grass is lower, branches are higher."""
 _TREE_CELLS: Final = 60
 """Least number of cells of what seems to move below a tree's crown: branches swing."""
 _PERSON_M: Final = 1.2
@@ -102,6 +106,18 @@ def moving_cells(held: Columns) -> Bools:
     return np.asarray((things > 0) & ~stays & (2 * around >= _around(things > 0)) & (around >= 3))
 
 
+def driven_cells(held: Columns, drive_xyh_m: npt.NDArray[np.float64]) -> Bools:
+    """Mask (rows, columns) of cells where things were seen in the way of a drive, which went through: they moved.
+
+    drive_xyh_m : (p, 4) x, y and height of the sensor (m) and the pass, in the order of time.
+    """
+    inside = np.zeros(held.top.shape, np.bool_)
+    for number in np.unique(drive_xyh_m[:, 3]).tolist():
+        x, y = (np.ascontiguousarray(drive_xyh_m[drive_xyh_m[:, 3] == number, k]) for k in (0, 1))
+        mark_corridor(x, y, _DRIVEN_M, held.grid.origin, CELL_M, inside)
+    return inside & ((held.levels & np.uint32(_DRIVEN_LEVELS)) > 0)
+
+
 def _around(cells: Bools) -> Int32:
     counted = cv2.boxFilter(cells.view(np.uint8), cv2.CV_32S, (3, 3), None, (-1, -1), False, cv2.BORDER_CONSTANT)
     return np.asarray(counted, np.int32)
@@ -124,6 +140,9 @@ def tracks(held: Columns, moving: Bools) -> tuple[Int32, Int32]:
         target = vehicle if sides_m(inside)[1] >= _PERSON_M else person
         wider = cv2.dilate(inside.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
         target[part][wider] = np.maximum(target[part][wider], reached)
+        if target is vehicle:  # all that was seen there below the higher things, however far apart rings meet it
+            own = np.where(inside, highest_levels(held.levels[part], round(_THING_M[1] / LEVEL_M) - 1), 0)
+            vehicle[part] = np.maximum(vehicle[part], own)
         if target is vehicle and reached > _LOWEST_BODY:
             around = slice(max(low - 2, 0), low + height + 2), slice(max(left - 2, 0), left + width + 2)
             target[around] = np.maximum(target[around], load_levels(held, around, label[around] == k))
@@ -145,8 +164,13 @@ def load_levels(held: Columns, part: tuple[slice, slice], inside: Bools) -> Int3
     along = high & ((highs & ~with_neighbours(things)) == 0).all(axis=-1)
     if 2 * np.count_nonzero(along) < np.count_nonzero(high):
         return np.zeros(inside.shape, np.int32)
-    bits = np.maximum(held.levels[part] & np.uint32((1 << (TALLEST + 1)) - 1), 1)
-    return np.where(along, np.log2(bits).astype(np.int32) + 1, 0)
+    return np.where(along, highest_levels(held.levels[part], TALLEST), 0)
+
+
+def highest_levels(levels: npt.NDArray[np.uint32], highest: int) -> Int32:
+    """Returns one more than the highest level, up to one, that was seen in each cell (rows, columns)."""
+    bits = np.maximum(levels & np.uint32((1 << (highest + 1)) - 1), 1)
+    return np.asarray(np.log2(bits).astype(np.int32) + 1)
 
 
 def with_neighbours(slots: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:

@@ -16,6 +16,7 @@ from roadscan.assets.moving import (
     TALL,
     Columns,
     columns_of,
+    driven_cells,
     moving_cells,
     returns_of,
     sides_m,
@@ -89,11 +90,12 @@ class Groups(NamedTuple):
 
 
 def road_users(
-    returns: Returns, above_m: npt.NDArray[np.float32], on_ground: Bools, cubes: Cubes, window: Box
-) -> Users:
+    returns: Returns, above_m: npt.NDArray[np.float32], on_ground: Bools, cubes: Cubes, window: Box,
+    drive_xyh_m: Float64,
+) -> Users:  # fmt: skip
     """Returns masks of vehicles and people among the returns that do not lie on the ground."""
     raster = columns_of(returns, above_m, on_ground, window)
-    moving = moving_cells(raster)
+    moving = moving_cells(raster) | driven_cells(raster, drive_xyh_m)
     vehicle, person = tracks(raster, moving)
     parked = parked_cells(raster, moving, Bodies(returns, above_m, on_ground, cubes))
     return Users(

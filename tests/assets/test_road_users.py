@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from roadscan.assets import classes
 from roadscan.assets.ground.grid import Grid
@@ -64,9 +65,16 @@ def left_over(scene: Scene, framed: np.ndarray, last_s: float = 0.0) -> tuple[fl
 
 
 def test_three_seconds_of_a_drive() -> None:
-    cars, people = left_over(*drive(slice(30, 40)))
+    """Who follows the recording car is seen where that has just been, and belongs to no frame."""
+    scene, framed = drive(slice(30, 40))
+    cars, people = left_over(scene, framed)
     assert cars <= 0.03
     assert people <= 0.15  # 0.09: some came into sight as they stood
+    returns, way = scene.returns, cKDTree(scene.drive_xyh_m[:, :2])
+    driven = way.query(np.column_stack([returns.x_m, returns.y_m]))[0] < 0.6
+    driven &= (scene.above_ground_m > 0.65) & (scene.above_ground_m < 1.35)
+    assert driven.sum() > 500
+    assert np.isin(scene.classes[driven], NO_ASSET).all()
 
 
 @pytest.mark.nightly

@@ -301,8 +301,10 @@ def placed_readings(batch: pa.RecordBatch, geometry: ScanGeometry | None, placem
         corner = placed.tiles.astype(np.int64) * placement.tile_quanta
         east, north = ((corner[:, k] + placed.quanta[:, k]) / QUANTA_PER_M for k in (0, 1))
         points = np.stack([east, north, placed.quanta[:, 2] / QUANTA_PER_M], axis=-1)
-        names = "epoch_gps_ns", "intensity", "laser"
-        epoch, intensity, laser = (batch.column(name).to_numpy()[placed.row] for name in names)
+        epoch, intensity = (batch.column(name).to_numpy()[placed.row] for name in ("epoch_gps_ns", "intensity"))
+        laser = np.zeros(len(points), np.uint8)
+        if "laser" in batch.schema.names:  # not every stage asks for it
+            laser = batch.column("laser").to_numpy()[placed.row]
         return PlacedReadings(points, intensity, np.arange(len(points)), epoch, laser)
     profiles = placement.by_profile(batch, geometry)
     kept = np.flatnonzero(profiles.kept.ravel())

@@ -34,5 +34,9 @@ def test_points_move_as_the_derivatives_say(parallel: bool) -> None:
     direction = rng.standard_normal((20, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     along = np.einsum("ni,ni->n", before, direction)
-    by = mount_partials(direction, np.cross(before, direction), along, seat)
+    by, by_range = mount_partials(direction, np.cross(before, direction), along, seat)
     np.testing.assert_allclose(by @ VALUES, np.einsum("ni,ni->n", after - before, direction), atol=2e-8)
+    # A reading that is a metre longer lies a metre farther along its beam.
+    beams = seen / np.linalg.norm(seen, axis=1, keepdims=True)
+    farther = (seen + np.where(parallel, np.sign(seen[:, 2:]) * [0.0, 0.0, 1.0], beams)) @ ROTATION.T + LEVER
+    np.testing.assert_allclose(by_range, np.einsum("ni,ni->n", farther - before, direction), atol=1e-12)

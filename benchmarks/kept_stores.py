@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from benchmarks.commands import command
@@ -42,37 +42,31 @@ def of_folder(folder: Path, km: float) -> Iterator[Figure]:
 
 def of_object_store(folder: Path, km: float) -> Iterator[Figure]:
     """Requests of commands on a store of moto's S3 server, counted there."""
+    commands = {"idle run": ("run",), "status": ("status",), "verify": ("verify",)}
+    yield from _of_objects(folder, "objects", km, commands)
+
+
+def of_site(folder: Path) -> Iterator[Figure]:
+    """The same of `publish`: a new site, and the same again."""
+    publish = ("publish", "--no-clouds", "--out", folder / "published")
+    yield from _of_objects(folder, "site", _SITE_KM, {"publish": publish, "publish again": publish})
+
+
+def _of_objects(folder: Path, name: str, km: float, commands: Mapping[str, tuple[str | Path, ...]]) -> Iterator[Figure]:
     from tests.object_store import served
 
     with served() as objects:
-        file = simulated_survey(folder, "objects", 1000 * km, f"{objects.url}/roads", _POSES_PER_S)
+        file = simulated_survey(folder, name, 1000 * km, f"{objects.url}/roads", _POSES_PER_S)
         objects.requests.clear()
         store = _ran(file, km)
         held = len(store.fs.find(store.root))
         yield Figure(f"{held:,} objects: requests of a first run", len(objects.requests), "")
-        for name, bar in (("run", _REQUESTS), ("status", None), ("verify", None)):
+        for told, (command_name, *options) in commands.items():
             objects.requests.clear()
-            done = command(name, file)
+            done = command(command_name, file, *options)
             _check(done.code, done.output)
-            told = "idle run" if name == "run" else name
+            bar = _REQUESTS if told == "idle run" else None
             yield Figure(f"{held:,} objects: requests of {told}", len(objects.requests), "", bar, "bar" if bar else "")
-            yield Figure(f"{held:,} objects: {told}, peak memory", done.peak_mb, "MB")
-
-
-def of_site(folder: Path) -> Iterator[Figure]:
-    """Requests of `publish` to moto's S3 server: of a new site, and again of the same."""
-    from tests.object_store import served
-
-    with served() as objects:
-        file = simulated_survey(folder, "site", 1000 * _SITE_KM, f"{objects.url}/roads", _POSES_PER_S)
-        store = _ran(file, _SITE_KM)
-        tiles = Manifest(store).files()["tile"]
-        held = len(store.fs.find(store.root))
-        for told in ("publish", "publish again"):
-            objects.requests.clear()
-            done = command("publish", file, "--no-clouds", "--out", folder / "published")
-            _check(done.code, done.output)
-            yield Figure(f"{held:,} objects, {tiles:,} tiles: requests of {told}", len(objects.requests), "")
             yield Figure(f"{held:,} objects: {told}, processor time", done.cpu_s, "s")
             yield Figure(f"{held:,} objects: {told}, peak memory", done.peak_mb, "MB")
 

@@ -78,8 +78,7 @@ def publish(
         typer.echo(f"page: {single} ({page.bytes / 1e6:,.1f} MB)")
         return
     if out is not None:
-        with session.store.looked():
-            made = published(material, out, lambda d, t: reporter.progress("publish", d, t))
+        made = published(material, out, lambda d, t: reporter.progress("publish", d, t))
         reporter.close()
         told = [f"failed: {path}: {reason}" for path, reason in made.failures]
         told += [f"left out: {reason}" for reason in made.left_out]

@@ -49,6 +49,11 @@ _CHUNK_READINGS = 1 << 20  # Readings per chunk, for which the working arrays ar
 _MAP_SCALE = 2.0
 """Upper bound on the scale of a map: Web Mercator reaches it at 60° latitude."""
 _EPOCH_COLUMNS = ("epoch_gps_ns", "pose_epoch_gps_ns")
+READING_COLUMNS: Final = {
+    "scans": ["epoch_gps_ns", "range", "intensity"],
+    "returns": [*_EPOCH_COLUMNS, "x_sensor_m", "y_sensor_m", "z_sensor_m", "intensity", "laser"],
+}
+"""Columns of each table of readings that say where on the map, how bright, and of which laser each is."""
 MOUNTING_COLUMNS: Final = (
     "lever_forward_m", "lever_right_m", "lever_down_m", "roll_rad", "pitch_rad", "heading_rad", "range_scale",
 )  # fmt: skip

@@ -111,18 +111,19 @@ def publish(material: Material, out: Path, report: Callable[[int, int], None] = 
     scratch.mkdir()
     try:
         writer = _Writer(scratch, known)
-        documents = list(site_documents(material))
-        for done, document in enumerate(documents):
-            writer.add(document)
-            if done % 50 == 0:
-                report(done, len(documents))
+        with material.store.looked():
+            documents = list(site_documents(material))
+            for done, document in enumerate(documents):
+                writer.add(document)
+                if done % 50 == 0:
+                    report(done, len(documents))
+            left_out = (*site_layers(material)[1], *_lost_report(material))
         report(len(documents), len(documents))
         told = {"layout": LAYOUT, "keys": writer.keys, "digests": writer.digests}
         (scratch / KEYS).write_bytes(checked_json(told))
         put_folder(scratch, out)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-    left_out = (*site_layers(material)[1], *_lost_report(material))
     return Published(out, len(writer.keys), writer.made, writer.bytes, tuple(writer.failures), left_out, tuple(damaged))
 
 

@@ -22,7 +22,7 @@ from roadscan.footprints.footprints import PRODUCT as FOOTPRINTS
 from roadscan.footprints.footprints import footprints_of
 from roadscan.georeference.plan.plan import SurveyPlan, plan_of
 from roadscan.georeference.plan.road import road_key
-from roadscan.georeference.sources import Georeferencer, MapSettings, RawSlice, geometry_of, read_rows
+from roadscan.georeference.sources import READING_COLUMNS, Georeferencer, MapSettings, RawSlice, geometry_of, read_rows
 from roadscan.navigation.tasks.pose_sigma import median_pose_sigma
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded
 from roadscan.poses.level import level_poses
@@ -60,11 +60,6 @@ _OTHER_RUNS: Final = 3
 _PROFILES_PER_M: Final = 20.0  # Profiles of a profiler on a stretch are thinned to about this many a metre.
 _READINGS: Final = 400_000
 """Readings of a sensor on a stretch, at most."""
-_COLUMNS: Final = {
-    "scans": ["epoch_gps_ns", "range", "intensity"],
-    "returns": ["epoch_gps_ns", "pose_epoch_gps_ns", "x_sensor_m", "y_sensor_m", "z_sensor_m", "intensity"],
-}
-"""Columns of each table of readings that are compared."""
 _BESIDE: Final = (-1, 0, 1)  # Offsets of a tile's neighbours, in columns and rows.
 _LEAST_CELLS: Final = 50
 """With fewer cells in common two sensors are not compared."""
@@ -317,7 +312,7 @@ def _placed(
     for one in slices:
         placement = placer.placement(one.source)
         for group in one.groups:
-            rows_of = read_rows(task.store, one.source, one.file, [group], _COLUMNS[one.source.table])
+            rows_of = read_rows(task.store, one.source, one.file, [group], READING_COLUMNS[one.source.table])
             batch = rows_of.combine_chunks().to_batches()[0]
             batch = batch.take(np.arange(0, batch.num_rows, step))
             yield (

@@ -16,7 +16,15 @@ from roadscan.adjust.places import Traverse
 from roadscan.core.grid import QUANTA_PER_M
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.georeference.place import EIGHT_TO_SIXTEEN_BITS, EVERYWHERE, Placement
-from roadscan.georeference.sources import Georeferencer, MapSettings, RawSlice, ReadingSource, geometry_of, read_rows
+from roadscan.georeference.sources import (
+    READING_COLUMNS,
+    Georeferencer,
+    MapSettings,
+    RawSlice,
+    ReadingSource,
+    geometry_of,
+    read_rows,
+)
 from roadscan.poses.level import LevelPoses, level_poses
 from roadscan.store.logs import DataFile
 from roadscan.store.store import Store
@@ -33,10 +41,6 @@ _AT_ONCE: Final = 64
 """Readings of profiles are cut off by so many."""
 _BESIDE_M: Final = 0.2
 """Other profiles see the place with readings so much farther to the side (m)."""
-_OF_RETURNS: Final = [
-    "epoch_gps_ns", "pose_epoch_gps_ns", "x_sensor_m", "y_sensor_m", "z_sensor_m", "intensity", "laser",
-]  # fmt: skip
-"""Columns of the returns of a lidar that are read."""
 _KEPT_GROUPS: Final = 8
 """Row groups of profiles cached, as they are stored."""
 _KEPT_RETURNS: Final = 6_000_000
@@ -183,8 +187,8 @@ class NearReader:
         """Returns lidar returns of a row group; each is a separate row."""
         known = self._returns.get((file.path, group))
         if known is None:
-            columns = _OF_RETURNS
-            batch = read_rows(self._store, file.source, file.path, [group], columns).combine_chunks().to_batches()[0]
+            rows = read_rows(self._store, file.source, file.path, [group], READING_COLUMNS["returns"])
+            batch = rows.combine_chunks().to_batches()[0]
             if self._one_return_in > 1:
                 batch = batch.take(np.arange(0, batch.num_rows, self._one_return_in))
             known = placed_readings(batch, None, self._placer.placement(file.source))
@@ -301,10 +305,8 @@ def placed_readings(batch: pa.RecordBatch, geometry: ScanGeometry | None, placem
         corner = placed.tiles.astype(np.int64) * placement.tile_quanta
         east, north = ((corner[:, k] + placed.quanta[:, k]) / QUANTA_PER_M for k in (0, 1))
         points = np.stack([east, north, placed.quanta[:, 2] / QUANTA_PER_M], axis=-1)
-        epoch, intensity = (batch.column(name).to_numpy()[placed.row] for name in ("epoch_gps_ns", "intensity"))
-        laser = np.zeros(len(points), np.uint8)
-        if "laser" in batch.schema.names:  # not every stage asks for it
-            laser = batch.column("laser").to_numpy()[placed.row]
+        names = "epoch_gps_ns", "intensity", "laser"
+        epoch, intensity, laser = (batch.column(name).to_numpy()[placed.row] for name in names)
         return PlacedReadings(points, intensity, np.arange(len(points)), epoch, laser)
     profiles = placement.by_profile(batch, geometry)
     kept = np.flatnonzero(profiles.kept.ravel())

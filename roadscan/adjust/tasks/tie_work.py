@@ -18,7 +18,7 @@ from roadscan.adjust.tasks.mountings import Mounted
 from roadscan.adjust.tasks.near import Circle, NearFile, NearReader, Sources, near_files
 from roadscan.adjust.tie_settings import TieSettings
 from roadscan.adjust.ties.at_place import Ties, ties_at
-from roadscan.adjust.ties.tie import HEIGHT, SAME_PASS
+from roadscan.adjust.ties.tie import HEIGHT, LASERS, SAME_PASS
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.plan.road import road_key
@@ -37,8 +37,6 @@ TIES: Final = "ties"
 
 _PLACES: Final = 50
 """Places of a task: a quarter of a kilometre of one road at the usual spacing."""
-_LASERS: Final = 256
-"""Lasers of a sensor are numbered by bytes."""
 _SEAM_CELLS: Final = 40
 """Least number of cells that both heads saw at a seam: a strip that is one cell wide has 160 along 4 m."""
 _SEAM_ASIDE_M: Final = 0.25
@@ -216,9 +214,9 @@ def _common(
         of_sensor = np.searchsorted(sensors, column[f"{end}_sensor"].astype(str))
         laser = column[f"{end}_laser"].astype(np.float64)
         seen = np.isfinite(laser)
-        number[seen, k] = _LASERS * of_sensor[seen] + laser[seen].astype(np.int32)
+        number[seen, k] = LASERS * of_sensor[seen] + laser[seen].astype(np.int32)
     within = (number[:, 1] >= 0) & (run[:, 0] == run[:, 1])
-    number[within, 2] = _LASERS * len(sensors) + run[within, 0]
+    number[within, 2] = LASERS * len(sensors) + run[within, 0]
     by_mounting, by_range = partials
     by_roll = by_mounting[:, :, MOUNTED.index("roll_rad")].sum(axis=1)
     found = np.column_stack([laser_sigma_m * by_range, roll_sigma_rad * by_roll])

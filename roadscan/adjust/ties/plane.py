@@ -20,7 +20,7 @@ from roadscan.adjust.kernels.plane_moments import add_moments, leave_out_far
 from roadscan.adjust.patches import PassReadings, level_from_map
 from roadscan.adjust.places import Place
 from roadscan.adjust.tie_settings import TieSettings
-from roadscan.adjust.ties.tie import COUNTS, PLANE, TOO_FAR, End, Tie
+from roadscan.adjust.ties.tie import COUNTS, LASERS, PLANE, TOO_FAR, End, Tie
 from roadscan.core.gpstime import NS_PER_S
 
 Float64 = npt.NDArray[np.float64]
@@ -37,8 +37,6 @@ _FIRST: Final = (0, 0, 0, 1, 1, 2)  # Rows of the six products of a symmetric 3 
 _SECOND: Final = (0, 1, 2, 1, 2, 2)  # … and their columns.
 _SHARE: Final = 6
 """One in this many planes is kept for each direction, if there are that many."""
-_LASERS: Final = 256
-"""Lasers are numbered by bytes."""
 _SPARSE: Final = 16
 """Numbers are looked up in a table where their range is no larger than this many times their count."""
 
@@ -88,7 +86,7 @@ class _Planes:
         rows = np.flatnonzero(self.of_return >= 0)
         rows = rows[rank[self.of_return[rows]] >= 0]
         window, size = rank[self.of_return[rows]], int(rank.max(initial=-1)) + 1
-        counts = np.bincount(window * _LASERS + near.laser[rows], minlength=size * _LASERS).reshape(size, _LASERS)
+        counts = np.bincount(window * LASERS + near.laser[rows], minlength=size * LASERS).reshape(size, LASERS)
         laser = counts.argmax(axis=1)
         own = near.laser[rows] == laser[window]
         rows, window = rows[own], window[own]

@@ -17,6 +17,9 @@ HEIGHT: Final = "height_tie"
 SHIFT: Final = "shift_tie"
 PLANE: Final = "plane_tie"
 
+LASERS: Final = 256
+"""Lasers of a sensor are numbered by bytes."""
+
 COUNTS: Final = ""
 FEW_CELLS: Final = "too few cells in common"
 TOO_FAR: Final = "farther apart than the bound"

@@ -26,7 +26,7 @@ from roadscan.georeference.centre_line import CentreLineBuffer
 from roadscan.georeference.place import EIGHT_TO_SIXTEEN_BITS, Located, Window, passes_of
 from roadscan.georeference.plan.centre_line import load_buffer
 from roadscan.georeference.sensor_places import sensor_places
-from roadscan.georeference.sources import Georeferencer, RawSlice, ReadingSource, geometry_of
+from roadscan.georeference.sources import READING_COLUMNS, Georeferencer, RawSlice, ReadingSource, geometry_of
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_trajectory
 from roadscan.poses.trajectory import Trajectory
 from roadscan.tiles.tasks.tile_plan import TileTask
@@ -35,10 +35,6 @@ Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
-_RETURN_COLUMNS: Final = [
-    "epoch_gps_ns", "pose_epoch_gps_ns", "x_sensor_m", "y_sensor_m", "z_sensor_m", "intensity", "laser",
-]  # fmt: skip
-_SCAN_COLUMNS: Final = ["epoch_gps_ns", "range", "intensity"]
 _DRIVE_TICK_NS: Final = 50_000_000  # Interval of the places of a drive (ns).
 _DRIVE_STEP_M: Final = 0.25
 """A place of a drive is kept if it lies in another square of this edge (m) than the one before."""
@@ -179,8 +175,7 @@ class _Block:
 
     def _of_sensor(self, one: RawSlice) -> Iterator[_Columns]:
         geometry = geometry_of(one.source)
-        wanted = _RETURN_COLUMNS if geometry is None else _SCAN_COLUMNS
-        for batch, found in self._placer.located(one, self._window, wanted):
+        for batch, found in self._placer.located(one, self._window, READING_COLUMNS[one.source.table]):
             if found.row.size:
                 epochs, intensity, laser = _recorded(batch, geometry, found)
                 single = np.ones(found.row.size, np.uint8)

@@ -1,8 +1,9 @@
 """How much the walls lean that a lidar sees along a road: they tell a roll that no tie within one drive shows.
 
 A stated roll of the boresight that is too large by ρ (rad) lowers what is to the right: a wall whose normal has the
-component r to the right of the vehicle gets a normal that points ρ r down. Walls that stand back from the road on both
-sides, as retaining walls do, are no roll: how much all walls lean away from the road is a second unknown.
+component r to the right of the vehicle gets a normal that points ρ r down. Walls that stand back from the road, as
+retaining walls do, are no roll: how much all walls lean away from the road is a second unknown. Where a road has walls
+on one side alone, the stated σ of that unknown is that of the roll.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ _LEAST_SHARE: Final = 0.5
 """Where fewer of the planes agree, they are no walls, but hedges and banks."""
 _HOUSE_RAD: Final = np.radians(0.1)
 """1 σ of the lean that all walls of a street have in common: houses are built upright to some mm a metre."""
+_BACK_RAD: Final = np.radians(0.3)
+"""1 σ of how far all walls of a street stand back from it, without retaining walls."""
 _DOUBTED: Final = 3.0
 """A lean beyond this many σ is reported."""
 _ROUNDS: Final = 20  # of weights; they settle in about ten
@@ -45,7 +48,7 @@ WALLS: Final = Witness(
     "walls_upright",
     input="rig file",
     fault="The roll of a lidar's boresight, or of the poses of a drive, is off.",
-    asks="walls that the lidar saw on both sides of the road: they stand upright",
+    asks="walls beside the road that the lidar saw: they stand upright",
     does="the lean that all of them have in common is told; nothing is corrected by it",
     told=("findings",),
 )
@@ -99,14 +102,14 @@ def _robust(design: Float64, observed: Float64) -> tuple[float, float, int]:
 
     design : (n, 2).
     """
-    weight = np.ones(observed.size)
+    values = np.zeros(2)
     for _ in range(_ROUNDS):
-        # Were all walls on one side, both unknowns would have a σ far above any limit.
-        inverse = np.linalg.inv(design.T @ (weight[:, None] * design) + 1e-6 * np.eye(2))
-        values = inverse @ design.T @ (weight * observed)
         residual = np.abs(observed - design @ values)
         spread = max(_NORMAL * float(np.median(residual)), _LEAST_SPREAD_RAD)
         weight = (1.0 + (residual / (_NEAR * spread)) ** 2) ** -2.0
+        prior = np.diag([0.0, (spread / _BACK_RAD) ** 2])
+        inverse = np.linalg.inv(design.T @ (weight[:, None] * design) + prior)
+        values = inverse @ design.T @ (weight * observed)
     return float(values[0]), float(spread * np.sqrt(inverse[0, 0])), int((residual < _DOUBTED * spread).sum())
 
 
@@ -115,9 +118,9 @@ def lean_findings(found: Sequence[Lean], runs: Sequence[str]) -> list[Finding]:
     return [
         WALLS.finds(
             f"{one.sensor} in run '{runs[one.run]}'",
-            f"{one.walls} walls on both sides of the road lean as if the stated roll were "
-            f"{np.degrees(one.roll_rad):+.2f}° too large (σ {np.degrees(one.sigma_rad):.2f}°), that of the boresight in "
-            "the rig file or that of the poses; nothing is corrected by it: calibrate the boresight, or look at the "
+            f"{one.walls} walls beside the road lean as if the stated roll were "
+            f"{np.degrees(one.roll_rad):+.2f}° too large (σ {np.degrees(one.sigma_rad):.2f}°), that of the boresight "
+            "in the rig file or that of the poses; nothing is corrected by it: calibrate the boresight, or look at the "
             "attitude of the poses",
         )
         for one in found

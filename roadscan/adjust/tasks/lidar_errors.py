@@ -10,20 +10,22 @@ import numpy.typing as npt
 
 from roadscan.adjust.adjustment import CommonErrors
 from roadscan.adjust.observations import COMMON, MOUNTED
-from roadscan.adjust.tasks.mountings import DOUBTED, Mounted
+from roadscan.adjust.tasks.mountings import Mounted
 from roadscan.adjust.ties.tie import LASERS
 from roadscan.core.witness import Finding, Witness
 
 _DETERMINED: Final = 0.7
 """An error whose σ fell below this share of its prior is determined: its variance is halved."""
+_CHANCE: Final = 0.0027
+"""Chance that any error of a survey without faults is named: that of 3 σ of one."""
 
 LASER_RANGES: Final = Witness(
     "laser_ranges_of_ties",
     input="lidar",
     fault="The ranges of one laser are longer or shorter for good than those of the others.",
     asks="planes that several lasers of the lidar saw, in one drive and in several",
-    does="its error is estimated for the adjustment, readings stay as they are; one that is off by more than three of "
-    "the σ that `sigma_laser_m` states is named",
+    does="its error is estimated for the adjustment, readings stay as they are; one that is off by more than the σ of "
+    "`sigma_laser_m` allows is named",
     told=("findings",),
 )
 SEEMING_ROLL: Final = Witness(
@@ -31,7 +33,7 @@ SEEMING_ROLL: Final = Witness(
     input="rig file",
     fault="A lidar's boresight, or all poses of a drive, are rolled by more than is stated.",
     asks="planes that the lidar saw again within the same drive",
-    does="the roll moves no pose and no reading; one beyond three of the σ of `sigma_seeming_roll_deg` is named",
+    does="the roll moves no pose and no reading; one beyond the σ of `sigma_seeming_roll_deg` is named",
     told=("findings",),
 )
 
@@ -96,9 +98,12 @@ def lidar_error_findings(found: CommonErrors, runs: Sequence[str], mounted: Moun
 
     Were that σ right, an estimate would have the variance by which the ties lower that of the prior.
     """
+    from scipy.special import ndtri
+
     laser_m, roll_deg = mounted.common_sigma[0], np.degrees(mounted.common_sigma[1])
-    shown = np.sqrt(np.maximum(1.0 - found.sigma**2, 0.0))
-    off = (found.sigma < _DETERMINED) & (np.abs(found.error) > DOUBTED * shown)
+    shown, known = np.sqrt(np.maximum(1.0 - found.sigma**2, 0.0)), found.sigma < _DETERMINED
+    limit = -ndtri(0.5 * _CHANCE / max(int(known.sum()), 1))
+    off = known & (np.abs(found.error) > limit * shown)
     said = []
     for number, error, sigma in zip(found.number[off], found.error[off], found.sigma[off], strict=True):
         sensor, laser = divmod(int(number), LASERS)

@@ -134,6 +134,18 @@ class CameraErrors:
 
 
 @dataclass(frozen=True)
+class CommonErrors:
+    """Errors that ties have in common after the adjustment; e of them."""
+
+    number: Int64
+    """(e,) as `Observations.common` has it, rising."""
+    error: Float64
+    """(e,) in units of the prior σ."""
+    sigma: Float64
+    """(e,) 1 σ of these, in the same units."""
+
+
+@dataclass(frozen=True)
 class Adjustment:
     """The result of an adjustment: corrections of each run, and residuals of the observations."""
 
@@ -159,6 +171,7 @@ class Adjustment:
     control: ControlErrors
     mountings: MountingErrors
     cameras: CameraErrors
+    common: CommonErrors
     variance_factors: Mapping[str, float]
     """Of the stated variances, by kind of observation, by component of the processes, and of the surveys of control; 1
     where not estimated."""
@@ -281,14 +294,15 @@ def _once(
 ) -> Adjustment:
     """Returns an adjustment with the stated σ of each run's poses."""
     order = _canonical(observations)
-    ordered = observations.chosen(order)
+    numbers, common = _numbered(observations.common)
+    ordered = replace(observations, common=common).chosen(order)
     which = _used(ordered, settings.mode)
     chosen = ordered.chosen(which)
     components = HEIGHT_ALONE if settings.mode == "vertical" else np.ones(len(COMPONENTS), bool)
     control = ControlPoints.of(chosen, each_pass=settings.mode == "each_pass")
     shared = shared if settings.mode == "joint" else ((), ())
     first = Unknowns.of(priors, control, settings.knot_spacing_s, components, shared)
-    first = replace(first, commons=int(chosen.common.max(initial=-1)) + 1)
+    first = replace(first, commons=numbers.size)
     first.check(observations)
     priors, unknowns, rounds, alone = _without_surveys(first, chosen, settings)
     verdict = judged(*_survey_errors(unknowns, chosen, alone, rounds), settings)
@@ -306,7 +320,7 @@ def _once(
         tuple(p.run for p in priors), unknowns.knots, values, covariance, with_next,
         told[0][back], which[back], told[1][back], told[2][back], told[3][back],
         _of_control(unknowns, estimate, n, verdict.survey_factor), _of_mountings(unknowns, estimate, solution),
-        _of_cameras(unknowns, estimate, solution, joint),
+        _of_cameras(unknowns, estimate, solution, joint), _of_common(unknowns, estimate, numbers),
         {k: float(v) for k, v in factors.items()},
         estimate.rounds, estimate.settled, verdict, applied, tuple(priors), unknowns.active, response,
         factors_of_runs, fixed_runs(unknowns, _of_solution(unknowns, estimate.solution)),
@@ -541,6 +555,18 @@ def _of_cameras(
     error[there] = solution[numbers[there]] * prior[there]
     variance[there] = estimate.inverse.at(numbers[there], numbers[there]) * prior[there] ** 2
     return CameraErrors(tuple(one.sensor for one in unknowns.cameras), prior, error, np.sqrt(variance), joint)
+
+
+def _numbered(common: npt.NDArray[np.int32]) -> tuple[Int64, npt.NDArray[np.int32]]:
+    """Returns the numbers (e,) of errors that ties have in common, rising, and those (n, 3) without gaps; −1: none."""
+    numbers = np.unique(common[common >= 0])
+    dense = np.searchsorted(numbers, common).astype(np.int32)
+    return numbers.astype(np.int64), np.where(common >= 0, dense, np.int32(-1))
+
+
+def _of_common(unknowns: Unknowns, estimate: Estimate, numbers: Int64) -> CommonErrors:
+    own = unknowns.first_common + np.arange(numbers.size)
+    return CommonErrors(numbers, estimate.solution[own], np.sqrt(estimate.inverse.at(own, own)))
 
 
 def _joint(unknowns: Unknowns, estimate: Estimate, rounds: Rounds) -> Iterator[JointErrors]:

@@ -332,10 +332,12 @@ class Unknowns:
 
     def wanted_pairs(self) -> tuple[Int64, Int64]:
         """Pairs of unknowns whose covariance is needed: of a knot, of neighbouring knots, of a control point, of all
-        mountings.
+        mountings; of each error that ties have in common, its variance.
         """
         mounted, filmed = self.of_mountings.reshape(1, -1), self.of_cameras
         parts = [_pairs(self.of_control, self.of_control), _pairs(mounted, mounted), _pairs(filmed, filmed)]
+        common = np.arange(self.first_common, self.size)
+        parts.append((common, common))
         for run in range(len(self.priors)):
             numbers = self.of_run(run)
             parts += [_pairs(numbers, numbers), _pairs(numbers[:-1], numbers[1:])]

@@ -50,6 +50,7 @@ from roadscan.adjust.tasks.figures import (
 )
 from roadscan.adjust.tasks.hand_ties import HandWork, hand_file, hand_work, with_hand_ties
 from roadscan.adjust.tasks.heads import COMMON_M, exchanged, head_findings, odd_steps, seams, steps_of
+from roadscan.adjust.tasks.lidar_errors import lidar_error_findings, lidar_error_lines
 from roadscan.adjust.tasks.mountings import (
     Mounted,
     calibrated_sigma,
@@ -68,6 +69,7 @@ from roadscan.adjust.tasks.tie_depths import RETURNS, DepthTask, write_returns
 from roadscan.adjust.tasks.tie_work import TIES, KnownTies, TieTask, collect_ties, load_ties, tie_tasks
 from roadscan.adjust.tasks.ties_again import Again, first_ties, settled
 from roadscan.adjust.tasks.tracks import adjusted_sources, runs_of, tracks_of
+from roadscan.adjust.tasks.walls import lean_findings, leans
 from roadscan.adjust.tie_settings import PlaceSettings
 from roadscan.core.counted import counted as count_of
 from roadscan.core.counted import listed
@@ -302,6 +304,10 @@ def adjust_survey(session: Session) -> None:
     filmed = [] if solution.pictures is None else list(residuals_of(solution.pictures))
     keep_pictures(session.store, manifest, key, (_picture(plan, work, tables), shown, filmed), seen.rows)
     lines = [*_lines(work, again, evidence, solution, held, tables), *mounting_lines(solution.mountings), *not_drawn]
+    doubts += lean_findings(leans(evidence.ties.columns, work.tracks, evidence.runs), evidence.runs)
+    if solution.common is not None:
+        lines += lidar_error_lines(solution.common, evidence.runs, collector.mounted)
+        doubts += lidar_error_findings(solution.common, evidence.runs, collector.mounted)
     lines += picture_lines(solution.pictures, solution.cameras, solution.free)
     if config.mode in ("joint", "vertical"):
         doubts += failed_ties(evidence.ties, solution.tie_weight)

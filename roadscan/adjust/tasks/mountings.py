@@ -75,6 +75,11 @@ class Mounted:
     common_sigma: tuple[float, float] = (0.0, 0.0)
     """1 σ of how far the ranges of single lasers are off (m), and of a roll that ties of a drive seem to show (rad)."""
 
+    @property
+    def sensors(self) -> list[str]:
+        """Returns the names of all sensors, sorted."""
+        return sorted({sensor for _, sensor in self.stated})
+
     def number(self, run: str, sensor: str) -> int:
         """Returns the index of a run's sensor in `priors`, −1: not estimated."""
         keys = [one.key for one in self.priors]

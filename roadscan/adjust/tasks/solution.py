@@ -9,7 +9,7 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.adjustment import Adjustment, CameraErrors, ControlErrors, MountingErrors, adjust
+from roadscan.adjust.adjustment import Adjustment, CameraErrors, CommonErrors, ControlErrors, MountingErrors, adjust
 from roadscan.adjust.bundle.outcome import PictureOutcome, outcome_of
 from roadscan.adjust.bundle.self_check import FreeCameras, free_cameras
 from roadscan.adjust.bundle.solve import Approached, PictureEvidence, approached
@@ -133,6 +133,8 @@ class Solution:
     """Poses minus control as a whole, and 1 σ of the datum (m): see :func:`datum_figures`."""
     mountings: MountingErrors | None = None
     """Errors of the sensors' mountings; None where they are not estimated."""
+    common: CommonErrors | None = None
+    """Errors that ties of lidars have in common; None where they are not estimated."""
     cameras: CameraErrors | None = None
     """Errors of lenses and clocks; None where no picture takes part."""
     pictures: PictureOutcome | None = None
@@ -266,6 +268,7 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
         corrections, weight, points, control, tuple(found), tuple(line for line in lines if line),
         _left_out(adjusted.control, first, evidence), datum_figures(adjusted.verdict, adjusted.applied),
         adjusted.mountings if adjusted.mountings.sensors else None,
+        adjusted.common if adjusted.common.number.size else None,
         adjusted.cameras if approach else None, outcome, free,
     )  # fmt: skip
 

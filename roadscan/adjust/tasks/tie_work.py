@@ -11,14 +11,15 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from roadscan.adjust.observations import COMMON, KINDS, MOUNTED, Observations, mount_partials
+from roadscan.adjust.observations import KINDS, Observations, mount_partials
 from roadscan.adjust.patches import PassReadings, Shift, shifted
 from roadscan.adjust.places import Place, Traverse
+from roadscan.adjust.tasks.lidar_errors import common_errors
 from roadscan.adjust.tasks.mountings import Mounted
 from roadscan.adjust.tasks.near import Circle, NearFile, NearReader, Sources, near_files
 from roadscan.adjust.tie_settings import TieSettings
 from roadscan.adjust.ties.at_place import Ties, ties_at
-from roadscan.adjust.ties.tie import HEIGHT, LASERS, SAME_PASS
+from roadscan.adjust.ties.tie import HEIGHT, SAME_PASS
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.plan.road import road_key
@@ -197,32 +198,6 @@ def _by_mounting(
     return number, *mount_partials(shifts, turns, along, seat)
 
 
-def _common(
-    column: Mapping[str, npt.NDArray[Any]],
-    run: npt.NDArray[np.int32],
-    partials: Sequence[npt.NDArray[np.float64]],
-    mounted: Mounted,
-) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float64]]:
-    """Returns numbers (n, 3) of the errors that ties have in common, and derivatives by these.
-
-    partials : by the mounting (n, 2, 7), and by a range (n, 2), of each end.
-    """
-    laser_sigma_m, roll_sigma_rad = mounted.common_sigma
-    sensors = sorted({sensor for _, sensor in mounted.stated})
-    number = np.full((len(run), len(COMMON)), -1, np.int32)
-    for k, end in enumerate(("first", "second")):
-        of_sensor = np.searchsorted(sensors, column[f"{end}_sensor"].astype(str))
-        laser = column[f"{end}_laser"].astype(np.float64)
-        seen = np.isfinite(laser)
-        number[seen, k] = LASERS * of_sensor[seen] + laser[seen].astype(np.int32)
-    within = (number[:, 1] >= 0) & (run[:, 0] == run[:, 1])
-    number[within, 2] = LASERS * len(sensors) + run[within, 0]
-    by_mounting, by_range = partials
-    by_roll = by_mounting[:, :, MOUNTED.index("roll_rad")].sum(axis=1)
-    found = np.column_stack([laser_sigma_m * by_range, roll_sigma_rad * by_roll])
-    return np.where(found != 0.0, number, -1), found
-
-
 @dataclass(frozen=True)
 class KnownTies:
     """All ties of a survey that could be measured."""
@@ -305,7 +280,7 @@ def load_ties(
     of_run = np.array([[number[run] for run in column[f"{e}_run"]] for e in ends], np.int32).T.reshape(-1, 2)
     by_mounting = np.stack([by for _, by, _ in mounts], axis=1)
     by_range = np.stack([by for _, _, by in mounts], axis=1)
-    common, by_common = _common(column, of_run, (by_mounting, by_range), mounted)
+    common, by_common = common_errors(column, of_run, (by_mounting, by_range), mounted)
     observations = Observations(
         np.array([KINDS.index(kind) for kind in column["kind"]], np.uint8), of_run,
         epochs, partials, column["value_m"], column["sigma_m"], group.astype(np.int64), column["place"],

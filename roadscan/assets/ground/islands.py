@@ -43,7 +43,9 @@ def without_islands(place: Place, base: Surface, above_m: npt.NDArray[np.float32
     whole = seen & (cells * grid.cell_m**2 > _LARGEST_M2)[label]
     if not whole.any():
         return found
-    away, near = cv2.distanceTransformWithLabels((~whole).view(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    away, near = cv2.distanceTransformWithLabels(
+        (~whole).view(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
     known = np.zeros(int(near.max()) + 1)
     known[near[whole]] = height[whole]
     small = seen & ~whole

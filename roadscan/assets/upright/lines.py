@@ -173,7 +173,9 @@ def _row(scene: Scene, panel: Panel, run: list[tuple[int, float, float]]) -> dic
         if rows.size
         else {"returns": 0, "passes": [], "first_epoch_gps_ns": None, "last_epoch_gps_ns": None}
     )
-    counts = {name: getattr(panel, name)[numbers] * shares for name in ("returns", "stopped", "passed", "under", "leaves")}
+    counts = {
+        name: getattr(panel, name)[numbers] * shares for name in ("returns", "stopped", "passed", "under", "leaves")
+    }
     heights = {name: getattr(panel, name)[numbers] for name in ("ground_m", "low_m", "high_m", "bulk_m")}
     return {
         "x_m": (east + xy[:, 0]).tolist(), "y_m": (north + xy[:, 1]).tolist(),
@@ -218,9 +220,7 @@ def chain_of(panel: Panel) -> Chain:
     """Returns the chain of a whole panel, without the passes and epochs of its returns."""
     values = {name: getattr(panel, name).astype(np.float64) for name in STRETCHES if name != "length_m"}
     values["length_m"] = np.hypot(*np.diff(panel.xy_m, axis=0).T)
-    return Chain(
-        panel.xy_m, values, panel.across_m, panel.seen_from_m, panel.rows.size, frozenset(), (0, 0)
-    )
+    return Chain(panel.xy_m, values, panel.across_m, panel.seen_from_m, panel.rows.size, frozenset(), (0, 0))
 
 
 def _reversed(part: Chain) -> Chain:

@@ -205,7 +205,7 @@ def _on_line(scene: Scene, place: tuple[float, float], along: Float64, middle_m:
     ends = np.flatnonzero(~good[:-1] & ~good[1:])  # two slices above one another that show no surface
     top = int(ends[ends > np.argmax(good)][0]) if good.any() else 0
     on &= level < top
-    if LOWEST_M + _SLICE_M * top < _LOWEST_TOP_M or on.sum() < _FEWEST:
+    if not _LOWEST_TOP_M <= LOWEST_M + _SLICE_M * top < _GARDEN_M or on.sum() < _FEWEST:
         return near[:0], middle_m
     past, off = t[on] - t[on].mean(), d[on] - d[on].mean()
     off -= past * float(past @ off) / max(float(past @ past), 1e-9)

@@ -29,7 +29,9 @@ _HOVERS: Final = 0.05
 """A surface that begins high above the ground hovers where this share of the sight lines passes below it; elsewhere
 something stands before its foot."""
 _LEAST_FENCE_M, _LEAST_WALL_M = 1.8, 2.5  # Least length of a fence, such as a gate, and of a wall (m).
-_MOST_PASSING: Final = 0.85  # What lets more of the sight lines pass is no surface: parts of a room, seen through panes.
+_LEAST_PASSING: Final = 0.08  # The uneven top of a wall lets fewer of the sight lines pass than any fence.
+_RAIL_PASSING: Final = 0.5  # What lets more of the sight lines pass is no rail, but a low fence.
+_MOST_PASSING: Final = 0.8  # What lets more of the sight lines pass is no surface: parts of a room, seen through panes.
 _FACADE_M: Final = 3.0  # What is higher is a façade (m), …
 _OPEN_M: Final = 1.4  # … as is what is higher than this (m) and rises beyond what scanners saw.
 _GARDEN_M: Final = 1.6  # What is lower than this (m) is no part of a façade.
@@ -57,9 +59,10 @@ def told(chain: Chain) -> Surface | None:
         return "facade" if chain.passing < 0.4 and chain.length_m >= 2.0 else None
     if low > 0.6 and (low > 1.2 or (chain.hovering > _HOVERS and chain.porous < _POROUS)):
         return None
-    if bulk > 0.36 and 0.5 <= top <= 1.15 and top - bulk < 0.5 and chain.length_m >= 4.0:
+    is_rail = bulk > 0.36 and 0.5 <= top <= 1.15 and top - bulk < 0.5 and chain.passing < _RAIL_PASSING
+    if is_rail and chain.length_m >= 4.0:
         return "guardrail"
-    if chain.porous >= _POROUS:
+    if chain.porous >= _POROUS and chain.passing >= _LEAST_PASSING:
         is_fence = top >= 0.6 and chain.length_m >= _LEAST_FENCE_M and chain.passing <= _MOST_PASSING
         return "fence" if is_fence else None
     if top > 1.25:

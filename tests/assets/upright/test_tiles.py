@@ -83,7 +83,7 @@ def test_a_chain_was_seen_by_the_passes_of_all_its_pieces() -> None:
     def piece(start_m: float, passes: list[int]) -> dict[str, object]:
         values = {name: [0.0] for name in STRETCHES} | {"high_m": [1.5], "length_m": [5.0]}
         return {
-            "x_m": [start_m, start_m + 5.0], "y_m": [0.0, 0.0], **values, "across_m": 0.01, "vegetation": 0.0,
+            "x_m": [start_m, start_m + 5.0], "y_m": [0.0, 0.0], **values, "across_m": 0.01,
             "sensor_x_m": 0.0, "sensor_y_m": 9.0, "seen": 100, "passes": passes,
             "first_epoch_gps_ns": passes[0], "last_epoch_gps_ns": passes[-1],
         }  # fmt: skip

@@ -29,8 +29,8 @@ def without_islands(place: Place, base: Surface, above_m: npt.NDArray[np.float32
 
     Behind a hedge or a wall the ground is hidden, and the lowest that is seen there is no ground.
 
-    base : the first estimate of the ground. above_m, found : (n,) heights above it, and which returns lie on the ground.
-    grid : cells in which patches are told.
+    base : the first estimate of the ground. above_m, found : (n,) heights above it, and which returns are ground.
+    grid : of the cells in which patches are told.
     """
     x, y, per_m = place.returns.x_m, place.returns.y_m, 1.0 / grid.cell_m
     sums = np.zeros((*grid.shape, 3))

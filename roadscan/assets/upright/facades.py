@@ -34,7 +34,7 @@ def _filled(values: Float64) -> Float64:
 
 
 def beside(scene: Scene, rows: Int64, before_m: float = _BEFORE_M, behind_m: float = _BEHIND_M) -> Int64:
-    """Returns the returns of a surface (`rows`), and those close before it or behind it; defaults are a façade's (m)."""
+    """Returns the returns of a surface (`rows`), and those close before and behind it, by default a façade's."""
     returns = scene.returns
     xy = np.column_stack([returns.x_m[rows], returns.y_m[rows]])
     middle = xy.mean(axis=0)

@@ -25,7 +25,8 @@ PIECE_SCHEMA: Final = pa.schema(
     [("x_m", pa.list_(pa.float64())), ("y_m", pa.list_(pa.float64()))]
     + [(name, pa.list_(pa.float64())) for name in STRETCHES]
     + [
-        ("across_m", pa.float64()), ("sensor_x_m", pa.float64()), ("sensor_y_m", pa.float64()), ("seen", pa.int64()), ("passes", pa.list_(pa.int32())),
+        ("across_m", pa.float64()), ("sensor_x_m", pa.float64()), ("sensor_y_m", pa.float64()),
+        ("seen", pa.int64()), ("passes", pa.list_(pa.int32())),
         ("first_epoch_gps_ns", pa.int64()), ("last_epoch_gps_ns", pa.int64()),
     ]
 )  # fmt: skip

@@ -37,10 +37,11 @@ _OPEN_M: Final = 1.4  # … as is what is higher than this (m) and rises beyond 
 _GARDEN_M: Final = 1.6  # What is lower than this (m) is no part of a façade.
 _LEAST_TOP_M: Final = 0.5  # Lower surfaces (m) are of no kind.
 _CHANGE_M: Final = 1.5  # A change of sort along a surface counts as so many metres of another sort.
-_MOST_VEGETATION: Final = 0.5
-"""Surfaces with a larger share of vegetation are hedges, unless they are thinner (m) or let more sight lines pass. On
-sweeps 0–3 of the labelled street hedges have 43 to 55 mm, and let 24 % pass at the most."""
-_THIN_M, _MORE_THAN_LEAVES = 0.035, 0.4
+_MOST_VEGETATION: Final = 0.5  # Surfaces with a larger share of vegetation are hedges, …
+_THIN_M: Final = 0.035  # … unless they scatter less across their plane (m) …
+_MORE_THAN_LEAVES: Final = 0.4
+"""… or let a larger share of the sight lines pass. On sweeps 0–3 of the labelled street hedges scatter by 43 to 55 mm,
+and let 24 % pass at the most."""
 
 
 def told(chain: Chain) -> Surface | None:
@@ -86,9 +87,8 @@ def parts_of(chain: Chain) -> list[tuple[Surface | None, int, int]]:
     out: list[tuple[Surface | None, int, int]] = []
     for first, last in itertools.pairwise(edges):
         name = told(chain.part(first, last))
-        if out and out[-1][0] == name:
-            first = out.pop()[1]
-        out.append((name, first, last))
+        begin = out.pop()[1] if out and out[-1][0] == name else first
+        out.append((name, begin, last))
     return out
 
 

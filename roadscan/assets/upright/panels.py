@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 from typing import Final
@@ -21,9 +22,10 @@ from roadscan.assets.upright.regions import LOWEST_M, Region, regions_of
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-STRETCH_M: Final = 1.0  # Length of a stretch (m).
+STRETCH_M: Final = 1.0  # Length of a stretch (m), about.
 _MOST_LINES: Final = 150_000
 """Sight lines that are compared with surfaces: every k-th return, so that there are no more."""
+_STRETCH_LEAST_M: Final = 1.0  # Lower and higher parts of a surface that are shorter (m) are not told apart.
 _END_M: Final = 0.25  # A surface ends with the last part of it so long (m) …
 _END_RETURNS: Final = 3  # … that holds so many returns.
 _LAST_M: Final = 0.5  # So long a part at an end tells how high a surface ends (m).
@@ -31,7 +33,7 @@ _LOWEST_TOP_M, _GARDEN_M = 0.5, 1.6
 """A low surface, whose ends are followed, is so high at the least and at the most (m) …"""
 _STEPS, _HALF_M = 8, 0.5
 """… and is followed so many steps, each so long (m), …"""
-_MOST_MISSED: Final = 2  # … over so many that do not show it.
+_MOST_MISSED: Final = 3  # … over so many that do not show it.
 _AROUND_M, _THIN_M, _SLICE_M = 0.45, 0.1, 0.1
 """Returns so near to a place and, on its line, so near to that tell of slices so high (m)."""
 _SLICES: Final = 15  # So many lie below the greatest height.
@@ -115,8 +117,8 @@ def _panel(scene: Scene, region: Region, highest_deg: float) -> Panel | None:
     t, d, stretch = np.empty(rows.size), np.empty(rows.size), np.empty(rows.size, np.int32)
     beside_line(returns.x_m, returns.y_m, rows, region.middle_xy_m, region.along, t, d)
     begin, end = _ends(t)
-    count = max(1, round((end - begin) / STRETCH_M))
-    edges = np.linspace(begin, end, count + 1)
+    edges = _edges(t, scene.above_ground_m[rows], begin, end)
+    count = edges.size - 1
     in_stretches(t, edges, stretch)
     middle, near = _medians(d, stretch, count), np.empty(rows.size, np.bool_)
     near_middles(t, d, stretch, edges, middle, _BESIDE_M, near)
@@ -222,6 +224,23 @@ def _ends(t: Float64) -> tuple[float, float]:
     if not held.size:
         return first, float(t.max())
     return float(t[bins == held[0]].min()), float(t[bins == held[-1]].max())
+
+
+def _edges(t: Float64, above_m: npt.NDArray[np.float32], begin: float, end: float) -> Float64:
+    """Returns where stretches begin along a line, and where the last one ends: none holds a low and a high part."""
+    count = max(int((end - begin) / _END_M), 1)
+    bins = np.clip(((t - begin) / _END_M).astype(np.int64), 0, count - 1)
+    top = np.full(count, -np.inf, np.float32)
+    np.maximum.at(top, bins, above_m)
+    some = np.flatnonzero(np.isfinite(top))
+    low = (top[some] <= _GARDEN_M).astype(np.int64)
+    first = np.flatnonzero(np.append(True, np.diff(low) != 0))
+    long = np.diff(np.append(some[first], count)) * _END_M >= _STRETCH_LEAST_M
+    first = first[long]
+    first = first[np.append(True, np.diff(low[first]) != 0)][1:] if first.size else first
+    cuts = np.concatenate([[begin], begin + some[first] * _END_M, [end]])
+    parts = [np.linspace(a, b, max(1, round((b - a) / STRETCH_M)), endpoint=False) for a, b in itertools.pairwise(cuts)]
+    return np.concatenate([*parts, [end]])
 
 
 def _medians(d: Float64, stretch: npt.NDArray[np.int32], count: int) -> Float64:

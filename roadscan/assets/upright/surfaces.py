@@ -28,7 +28,7 @@ _POROUS: Final = 0.5
 _HOVERS: Final = 0.05
 """A surface that begins high above the ground hovers where this share of the sight lines passes below it; elsewhere
 something stands before its foot."""
-_LEAST_FENCE_M, _LEAST_WALL_M = 1.8, 2.5  # Least length of a fence, such as a gate, and of a wall (m).
+_LEAST_FENCE_M, _LEAST_WALL_M = 1.5, 2.5  # Least length of a fence, such as a gate, and of a wall (m).
 _LEAST_PASSING: Final = 0.08  # The uneven top of a wall lets fewer of the sight lines pass than any fence.
 _RAIL_PASSING: Final = 0.5  # What lets more of the sight lines pass is no rail, but a low fence.
 _MOST_PASSING: Final = 0.8  # What lets more of the sight lines pass is no surface: parts of a room, seen through panes.

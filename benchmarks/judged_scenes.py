@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from benchmarks.drawn_streets import drawn_street
 from benchmarks.hard_streets import hard_street
-from benchmarks.labelled_returns import CLASSES, labelled_returns
+from benchmarks.labelled_returns import CLASSES, LabelledReturns, labelled_returns
 from benchmarks.labelled_street import labelled_sweeps, laid_out, recording_folder
 from benchmarks.street_scores import CAR, NOT_JUDGED, VEGETATION
 from benchmarks.street_scores import POLE as POLE_LABEL
@@ -92,13 +92,7 @@ def judged_scenes(folder: Path) -> Iterator[JudgedScene]:
 def simulated(street: Street, source: str, weight: float) -> JudgedScene:
     """Return the scene of a simulated street."""
     seen = labelled_returns(street)
-    returns, (east, north) = seen.returns, seen.returns.corner_m
-    station, offset = seen.surface.station_offset_m(east + returns.x_m, north + returns.y_m)
-    inside = np.flatnonzero(
-        (np.abs(offset) < _BESIDE_M) & (station > -_BEFORE_M) & (station < street.length_m + _BEFORE_M)
-    )
-    place = np.stack([returns.x_m[inside], returns.y_m[inside]])
-    window = Box(*(np.floor(place.min(axis=1) / 3.0) * 3.0 - 3.0), *(np.ceil(place.max(axis=1) / 3.0) * 3.0 + 3.0))
+    returns, (inside, window, _, _) = seen.returns, in_window(seen, street)
     table = np.full(len(CLASSES), OTHER, np.uint8)
     for name, number in _OF_CLASS.items():
         table[CLASSES.index(name)] = number
@@ -107,6 +101,18 @@ def simulated(street: Street, source: str, weight: float) -> JudgedScene:
         what[seen.kind[inside] == seen.kinds.index(kind)] = _OF_KIND[kind]
     scene = make_scene(returns.at(inside), window, window, seen.drive_xyh_m)
     return JudgedScene(scene, what, street.id, source, weight)
+
+
+def in_window(seen: LabelledReturns, street: Street) -> tuple[npt.NDArray[np.int64], Box, Float64, Float64]:
+    """Rows (k,) of the returns of a simulated street that are taken, their window, stations and offsets (k,; m)."""
+    returns, (east, north) = seen.returns, seen.returns.corner_m
+    station, offset = seen.surface.station_offset_m(east + returns.x_m, north + returns.y_m)
+    inside = np.flatnonzero(
+        (np.abs(offset) < _BESIDE_M) & (station > -_BEFORE_M) & (station < street.length_m + _BEFORE_M)
+    )
+    place = np.stack([returns.x_m[inside], returns.y_m[inside]])
+    window = Box(*(np.floor(place.min(axis=1) / 3.0) * 3.0 - 3.0), *(np.ceil(place.max(axis=1) / 3.0) * 3.0 + 3.0))
+    return inside, window, station[inside], offset[inside]
 
 
 # --- the recording -----------------------------------------------------------------------------------

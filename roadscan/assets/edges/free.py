@@ -21,7 +21,7 @@ from roadscan.core.extras import cv2
 
 Float64 = npt.NDArray[np.float64]
 
-KERB: Final = Judge("kerb", "9d7feef1eaa382a5")
+KERB: Final = Judge("kerb", "cdef227f1ee2f1fc")
 """Whether a node of an edge lies at a kerb."""
 LEAST: Final = 0.5
 """An edge is cut where it is less probable (smoothed) that it is a kerb."""

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from roadscan.assets.ground.filling import filled
 from roadscan.assets.ground.grid import Grid, grid_over
+from roadscan.assets.ground.islands import without_islands
 from roadscan.assets.ground.morphological import bare_cells, without_pits
 from roadscan.assets.ground.surface import Found, Place, Surface
 from roadscan.assets.ground.undersides import undersides
@@ -78,7 +79,7 @@ def dense_ground(place: Place) -> Found:
     found = np.empty(x.size, np.bool_)
     reach = _REACH_M + cells.noise_m
     on_ground(x, y, above, fine.origin, per_m, cells.rough, tolerance, cells.even_m, reach, found)
-    return Found(base, above, found)
+    return Found(base, above, without_islands(place, base, above, found, fine))
 
 
 def judged(sums: npt.NDArray[np.float64], statistics: Statistics) -> Cells:

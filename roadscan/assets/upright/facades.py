@@ -33,8 +33,8 @@ def _filled(values: Float64) -> Float64:
     return np.interp(np.arange(values.size), np.flatnonzero(known), values[known])
 
 
-def beside(scene: Scene, rows: Int64) -> Int64:
-    """Returns the returns of a façade: those of its surface (`rows`), and those close before it or behind it."""
+def beside(scene: Scene, rows: Int64, before_m: float = _BEFORE_M, behind_m: float = _BEHIND_M) -> Int64:
+    """Returns the returns of a surface (`rows`), and those close before and behind it, by default a façade's."""
     returns = scene.returns
     xy = np.column_stack([returns.x_m[rows], returns.y_m[rows]])
     middle = xy.mean(axis=0)
@@ -46,6 +46,6 @@ def beside(scene: Scene, rows: Int64) -> Int64:
     begin, end = float((some @ along).min()) - 0.3, float((some @ along).max()) + 0.3
     places, inside = places_of(scene), np.zeros(len(returns), np.bool_)
     inside[rows] = True
-    box = np.array([begin, end, -_BEHIND_M, _BEFORE_M])
+    box = np.array([begin, end, -behind_m, before_m])
     mark_strip(places.x_m, places.y_m, places.rows, middle, np.stack([along, normal]), box, inside)
     return np.flatnonzero(inside)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -19,14 +19,14 @@ from roadscan.compute.robust import SIGMA_OF_MAD
 Float64 = npt.NDArray[np.float64]
 
 STRETCHES: Final = (
-    "ground_m", "low_m", "high_m", "bulk_m", "length_m", "returns", "stopped", "passed", "under", "open_top",
+    "ground_m", "low_m", "high_m", "bulk_m", "length_m", "returns", "stopped", "passed", "under", "open_top", "leaves",
 )  # fmt: skip
 PIECE_SCHEMA: Final = pa.schema(
     [("x_m", pa.list_(pa.float64())), ("y_m", pa.list_(pa.float64()))]
     + [(name, pa.list_(pa.float64())) for name in STRETCHES]
     + [
-        ("across_m", pa.float64()), ("vegetation", pa.float64()), ("sensor_x_m", pa.float64()),
-        ("sensor_y_m", pa.float64()), ("seen", pa.int64()), ("passes", pa.list_(pa.int32())),
+        ("across_m", pa.float64()), ("sensor_x_m", pa.float64()), ("sensor_y_m", pa.float64()),
+        ("seen", pa.int64()), ("passes", pa.list_(pa.int32())),
         ("first_epoch_gps_ns", pa.int64()), ("last_epoch_gps_ns", pa.int64()),
     ]
 )  # fmt: skip
@@ -40,6 +40,7 @@ _JOIN_LEVEL_M: Final = 0.15
 _LOW_M: Final = 1.2
 """… and low ones are up to this height (m)."""
 _LEAST_LINES: Final = 15.0  # Fewer sight lines at a stretch do not tell whether it is porous.
+_MANY_PASSING: Final = 4.0  # So many lines that pass tell it, however few there are.
 _LEAST_PASSING: Final = 0.02  # Share of the sight lines that a porous stretch lets through.
 _SHORTEST_M: Final = 0.02  # Shorter pieces and gaps are left out (m).
 
@@ -53,7 +54,6 @@ class Chain:
     values: dict[str, Float64]
     """(k,) of each stretch, names of :data:`STRETCHES`; a gap between pieces is a stretch without returns."""
     across_m: float
-    vegetation: float
     sensor_xy_m: tuple[float, float]
     seen: int
     passes: frozenset[int]
@@ -76,6 +76,11 @@ class Chain:
         return float(1.2533 * SIGMA_OF_MAD * median(np.abs(above - median(above))) / math.sqrt(above.size))
 
     @property
+    def vegetation(self) -> float:
+        """Returns the share of its returns that are classed as vegetation."""
+        return float(self.values["leaves"].sum()) / max(float(self.values["returns"].sum()), 1.0)
+
+    @property
     def passing(self) -> float:
         """Returns the share of the sight lines at it that pass through."""
         passed, stopped = float(self.values["passed"].sum()), float(self.values["stopped"].sum())
@@ -87,11 +92,20 @@ class Chain:
 
         A solid surface lets lines through where it has a gap, a porous one all along. One line may be a false return.
         """
-        passed, lines = self.values["passed"], self.values["passed"] + self.values["stopped"]
-        told = lines >= _LEAST_LINES
+        told, through = self.lets_through()
         length = self.values["length_m"] * told
-        through = passed - 1.0 >= _LEAST_PASSING * lines
         return float(length @ through) / float(length.sum()) if told.any() else 0.0
+
+    def lets_through(self) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+        """Returns which stretches (k,) enough sight lines met to tell, and which of all let some through."""
+        passed, lines = self.values["passed"], self.values["passed"] + self.values["stopped"]
+        return (lines >= _LEAST_LINES) | (passed >= _MANY_PASSING), passed - 1.0 >= _LEAST_PASSING * lines
+
+    def part(self, first: int, last: int) -> Chain:
+        """Returns the chain of its stretches from the first to before the last."""
+        values = {name: value[first:last] for name, value in self.values.items()}
+        share = float(values["returns"].sum()) / max(float(self.values["returns"].sum()), 1.0)
+        return replace(self, xy_m=self.xy_m[first : last + 1], values=values, seen=round(share * self.seen))
 
     @property
     def hovering(self) -> float:
@@ -160,14 +174,16 @@ def _row(scene: Scene, panel: Panel, run: list[tuple[int, float, float]]) -> dic
         if rows.size
         else {"returns": 0, "passes": [], "first_epoch_gps_ns": None, "last_epoch_gps_ns": None}
     )
-    counts = {name: getattr(panel, name)[numbers] * shares for name in ("returns", "stopped", "passed", "under")}
+    counts = {
+        name: getattr(panel, name)[numbers] * shares for name in ("returns", "stopped", "passed", "under", "leaves")
+    }
     heights = {name: getattr(panel, name)[numbers] for name in ("ground_m", "low_m", "high_m", "bulk_m")}
     return {
         "x_m": (east + xy[:, 0]).tolist(), "y_m": (north + xy[:, 1]).tolist(),
         **{name: value.tolist() for name, value in (counts | heights).items()},
         "open_top": panel.open_top[numbers].astype(float).tolist(),
         "length_m": np.hypot(*np.diff(xy, axis=0).T).tolist(),
-        "across_m": panel.across_m, "vegetation": panel.vegetation, "sensor_x_m": east + panel.seen_from_m[0],
+        "across_m": panel.across_m, "sensor_x_m": east + panel.seen_from_m[0],
         "sensor_y_m": north + panel.seen_from_m[1], "seen": seen.pop("returns"), **seen,
     }  # fmt: skip
 
@@ -195,16 +211,23 @@ def chains_of(pieces: pa.Table) -> list[Chain]:
 def _part(row: dict[str, Any]) -> Chain:
     values = {name: np.array(row[name], np.float64) for name in STRETCHES}
     return Chain(
-        np.column_stack([row["x_m"], row["y_m"]]), values, row["across_m"], row["vegetation"],
+        np.column_stack([row["x_m"], row["y_m"]]), values, row["across_m"],
         (row["sensor_x_m"], row["sensor_y_m"]), row["seen"], frozenset(row["passes"]),
         (row["first_epoch_gps_ns"] or 0, row["last_epoch_gps_ns"] or 0),
     )  # fmt: skip
 
 
+def chain_of(panel: Panel) -> Chain:
+    """Returns the chain of a whole panel, without the passes and epochs of its returns."""
+    values = {name: getattr(panel, name).astype(np.float64) for name in STRETCHES if name != "length_m"}
+    values["length_m"] = np.hypot(*np.diff(panel.xy_m, axis=0).T)
+    return Chain(panel.xy_m, values, panel.across_m, panel.seen_from_m, panel.rows.size, frozenset(), (0, 0))
+
+
 def _reversed(part: Chain) -> Chain:
     values = {name: value[::-1] for name, value in part.values.items()}
     return Chain(
-        part.xy_m[::-1], values, part.across_m, part.vegetation, part.sensor_xy_m, part.seen, part.passes,
+        part.xy_m[::-1], values, part.across_m, part.sensor_xy_m, part.seen, part.passes,
         part.epochs_gps_ns,
     )  # fmt: skip
 
@@ -306,7 +329,7 @@ def _linked(parts: list[Chain]) -> Chain:
     epochs = [p.epochs_gps_ns for p in parts if p.seen]
     return Chain(
         np.concatenate(xy), {name: np.concatenate(v) for name, v in values.items()},
-        float(weights @ [p.across_m for p in parts]), float(weights @ [p.vegetation for p in parts]),
+        float(weights @ [p.across_m for p in parts]),
         (float(weights @ [p.sensor_xy_m[0] for p in parts]), float(weights @ [p.sensor_xy_m[1] for p in parts])),
         sum(p.seen for p in parts), frozenset().union(*(p.passes for p in parts)),
         (min((e for e, _ in epochs), default=0), max((e for _, e in epochs), default=0)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 from typing import Final
@@ -15,14 +16,31 @@ from roadscan.assets.kernels.upright_voxels import beside_line, in_stretches, ne
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.quantiles import median, quantiles
 from roadscan.assets.scene import Box, Scene
-from roadscan.assets.upright.regions import Region, regions_of
+from roadscan.assets.upright.places import places_of
+from roadscan.assets.upright.regions import LOWEST_M, Region, regions_of
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
-STRETCH_M: Final = 1.0  # Length of a stretch (m).
+STRETCH_M: Final = 1.0  # Length of a stretch (m), about.
 _MOST_LINES: Final = 150_000
 """Sight lines that are compared with surfaces: every k-th return, so that there are no more."""
+_STRETCH_LEAST_M: Final = 1.0  # Lower and higher parts of a surface that are shorter (m) are not told apart.
+_END_M: Final = 0.25  # A surface ends with the last part of it so long (m) …
+_END_RETURNS: Final = 3  # … that holds so many returns.
+_LAST_M: Final = 0.5  # So long a part at an end tells how high a surface ends (m).
+_LOWEST_TOP_M, _GARDEN_M = 0.5, 1.6
+"""A low surface, whose ends are followed, is so high at the least and at the most (m) …"""
+_STEPS, _HALF_M = 8, 0.5
+"""… and is followed so many steps, each so long (m), …"""
+_MOST_MISSED: Final = 3  # … over so many that do not show it.
+_AROUND_M, _THIN_M, _SLICE_M = 0.45, 0.1, 0.1
+"""Returns so near to a place and, on its line, so near to that tell of slices so high (m)."""
+_SLICES: Final = 15  # So many lie below the greatest height.
+_MOSTLY: Final = 0.7  # Share of the returns in front of and on the line that lie on it.
+_SHIFTS_M: Final = np.linspace(-0.2, 0.2, 11)  # The line may go on so far beside itself (m).
+_SPREAD_M: Final = 0.04  # Returns of a thin surface scatter no more across it (m).
+_FEWEST: Final = 5  # Fewer returns of a step do not tell.
 _HIGH_M: Final = 4.0
 """Sight lines through higher surfaces (m) are not counted."""
 _BESIDE_M: Final = 0.2
@@ -60,9 +78,9 @@ class Panel:
     under: Int64
     open_top: npt.NDArray[np.bool_]
     """(k,) True where the highest laser still meets it: its top is not seen."""
+    leaves: Int64
+    """(k,) returns that are classed as vegetation."""
     across_m: float
-    vegetation: float
-    """Share of its returns that are classed as vegetation."""
     seen_from_m: tuple[float, float]
     """Mean place of the sensor."""
     rows: Int64
@@ -94,13 +112,13 @@ def _highest_elevation_deg(scene: Scene) -> float:
 
 
 def _panel(scene: Scene, region: Region, highest_deg: float) -> Panel | None:
-    returns, rows = scene.returns, region.rows
+    returns, rows = scene.returns, _with_ends(scene, region)
     beside = np.array([-region.along[1], region.along[0]])
     t, d, stretch = np.empty(rows.size), np.empty(rows.size), np.empty(rows.size, np.int32)
     beside_line(returns.x_m, returns.y_m, rows, region.middle_xy_m, region.along, t, d)
-    begin, end = quantiles(t, [0.003, 0.997])
-    count = max(1, round((end - begin) / STRETCH_M))
-    edges = np.linspace(begin, end, count + 1)
+    begin, end = _ends(t)
+    edges = _edges(t, scene.above_ground_m[rows], begin, end)
+    count = edges.size - 1
     in_stretches(t, edges, stretch)
     middle, near = _medians(d, stretch, count), np.empty(rows.size, np.bool_)
     near_middles(t, d, stretch, edges, middle, _BESIDE_M, near)
@@ -126,12 +144,103 @@ def _panel(scene: Scene, region: Region, highest_deg: float) -> Panel | None:
     centre = (xy[:-1] + xy[1:]) / 2
     none = np.zeros(count, np.int64)
     sensor = float(np.mean(returns.sensor_x_m[rows])), float(np.mean(returns.sensor_y_m[rows]))
-    vegetation = float(np.bincount(scene.classes[rows], minlength=256)[list(_VEGETATION)].sum() / rows.size)
+    leaves = np.bincount(stretch[np.isin(scene.classes[rows], _VEGETATION)], minlength=count)
     return Panel(
         xy, scene.ground.height_at(centre[:, 0], centre[:, 1]), low, high, bulk,
-        np.bincount(stretch, minlength=count), none, none, none, open_top, region.across_m, vegetation, sensor, rows,
+        np.bincount(stretch, minlength=count), none, none, none, open_top, leaves, region.across_m, sensor, rows,
         stretch,
     )  # fmt: skip
+
+
+def _with_ends(scene: Scene, region: Region) -> Int64:
+    """Returns the returns of a region, with those of a low surface that goes on at its ends.
+
+    Where leaves stand close behind a fence or a wall, or where it meets another one, no plane is thin. So half a metre
+    is followed after half a metre, as long as most returns below its upper edge, slice by slice, lie on its line.
+    """
+    returns, rows = scene.returns, region.rows
+    more = [rows]
+    along = region.along
+    t, d = np.empty(rows.size), np.empty(rows.size)
+    beside_line(returns.x_m, returns.y_m, rows, region.middle_xy_m, along, t, d)
+    for sign, end in zip((-1.0, 1.0), _ends(t), strict=True):
+        last = np.abs(t - end) <= _LAST_M
+        top = float(scene.above_ground_m[rows[last]].max(initial=0.0))
+        if not _LOWEST_TOP_M <= top <= _GARDEN_M:
+            continue
+        middle, missed = median(d[last]), 0
+        for step in range(_STEPS):
+            at = end + sign * (step + 0.5) * _HALF_M
+            x, y = region.middle_xy_m + at * along + middle * np.array([-along[1], along[0]])
+            own, middle = _on_line(scene, (float(x), float(y)), along, middle)
+            more.append(own)
+            missed = 0 if own.size else missed + 1
+            if missed > _MOST_MISSED:
+                break
+    return np.unique(np.concatenate(more)) if sum(map(len, more)) > rows.size else rows
+
+
+def _on_line(scene: Scene, place: tuple[float, float], along: Float64, middle_m: float) -> tuple[Int64, float]:
+    """Returns the returns of half a metre of a low surface about a place, and how far left of its line they lie.
+
+    Nothing where the returns scatter across the line, as leaves do, or where too little is as high as a fence. What is
+    behind the line, seen from the sensor, says nothing against a surface.
+    """
+    returns = scene.returns
+    near = places_of(scene).within(*place, _AROUND_M)
+    t, d = np.empty(near.size), np.empty(near.size)
+    beside_line(returns.x_m, returns.y_m, near, np.array(place), along, t, d)
+    above = scene.above_ground_m[near]
+    here = (np.abs(t) <= _HALF_M / 2) & (above > LOWEST_M) & (above <= _GARDEN_M)
+    near, t, d, above = near[here], t[here], d[here], above[here]
+    if near.size < _FEWEST:
+        return near[:0], middle_m
+    sensor = np.array([np.mean(returns.sensor_x_m[near]), np.mean(returns.sensor_y_m[near])]) - place
+    before = -1.0 if float(along[0] * sensor[1] - along[1] * sensor[0]) > 0.0 else 1.0  # d times this grows backwards
+    held = [int((np.abs(d - shift) <= _THIN_M).sum()) for shift in _SHIFTS_M]
+    shift = float(_SHIFTS_M[int(np.argmax(held))])
+    on = np.abs(d - shift) <= _THIN_M
+    in_front = ~on & ((d - shift) * before < 0.0)
+    level = ((above - LOWEST_M) / _SLICE_M).astype(np.int64)
+    mine, others = (np.bincount(level[some], minlength=_SLICES + 2) for some in (on, in_front))
+    good = (mine > 0) & (mine >= others)
+    ends = np.flatnonzero(~good[:-1] & ~good[1:])  # two slices above one another that show no surface
+    top = int(ends[ends > np.argmax(good)][0]) if good.any() else 0
+    on &= level < top
+    if not _LOWEST_TOP_M <= LOWEST_M + _SLICE_M * top < _GARDEN_M or on.sum() < _FEWEST:
+        return near[:0], middle_m
+    past, off = t[on] - t[on].mean(), d[on] - d[on].mean()
+    off -= past * float(past @ off) / max(float(past @ past), 1e-9)
+    if (in_front & (level < top)).sum() > (1.0 - _MOSTLY) * on.sum() or float(np.std(off)) > _SPREAD_M:
+        return near[:0], middle_m
+    return near[on], middle_m + median(d[on])
+
+
+def _ends(t: Float64) -> tuple[float, float]:
+    """Returns where returns begin and end along a line, without single ones: a gate beside a house has few of all."""
+    first = float(t.min())
+    bins = ((t - first) / _END_M).astype(np.int64)
+    held = np.flatnonzero(np.bincount(bins) >= _END_RETURNS)
+    if not held.size:
+        return first, float(t.max())
+    return float(t[bins == held[0]].min()), float(t[bins == held[-1]].max())
+
+
+def _edges(t: Float64, above_m: npt.NDArray[np.float32], begin: float, end: float) -> Float64:
+    """Returns where stretches begin along a line, and where the last one ends: none holds a low and a high part."""
+    count = max(int((end - begin) / _END_M), 1)
+    bins = np.clip(((t - begin) / _END_M).astype(np.int64), 0, count - 1)
+    top = np.full(count, -np.inf, np.float32)
+    np.maximum.at(top, bins, above_m)
+    some = np.flatnonzero(np.isfinite(top))
+    low = (top[some] <= _GARDEN_M).astype(np.int64)
+    first = np.flatnonzero(np.append(True, np.diff(low) != 0))
+    long = np.diff(np.append(some[first], count)) * _END_M >= _STRETCH_LEAST_M
+    first = first[long]
+    first = first[np.append(True, np.diff(low[first]) != 0)][1:] if first.size else first
+    cuts = np.concatenate([[begin], begin + some[first] * _END_M, [end]])
+    parts = [np.linspace(a, b, max(1, round((b - a) / STRETCH_M)), endpoint=False) for a, b in itertools.pairwise(cuts)]
+    return np.concatenate([*parts, [end]])
 
 
 def _medians(d: Float64, stretch: npt.NDArray[np.int32], count: int) -> Float64:
@@ -156,35 +265,28 @@ def _with_sight(scene: Scene, panels: list[Panel]) -> list[Panel]:
     some = slice(None, None, step)
     taken = np.zeros(len(returns), np.bool_)
     taken[some] = True
-    low = [p.comes_near(scene.tile) and _is_low(p) for p in panels]
-    known = [p for p, asked in zip(panels, low, strict=True) if asked]
+    asked = [(p.high_m - p.ground_m <= _HIGH_M) & p.comes_near(scene.tile) for p in panels]
 
-    lines = np.concatenate([np.zeros((0, 4)), *(np.column_stack([p.xy_m[:-1], p.xy_m[1:]]) for p in known)])
+    lines = np.concatenate([np.zeros((0, 4)), *(
+        np.column_stack([p.xy_m[:-1], p.xy_m[1:]])[low] for p, low in zip(panels, asked, strict=True)
+    )])  # fmt: skip
     bands = np.concatenate([np.zeros((0, 4)), *(
-        np.column_stack([p.low_m + _RIM_M, p.high_m - _RIM_M, p.ground_m + _ABOVE_GROUND_M, p.low_m - _RIM_M])
-        for p in known
+        np.column_stack([p.low_m + _RIM_M, p.high_m - _RIM_M, p.ground_m + _ABOVE_GROUND_M, p.low_m - _RIM_M])[low]
+        for p, low in zip(panels, asked, strict=True)
     )])  # fmt: skip
     found = np.zeros((len(lines), 2), np.int64)
     passing_lines(
         returns.x_m[some], returns.y_m[some], returns.height_m[some], returns.sensor_x_m[some],
         returns.sensor_y_m[some], returns.sensor_height_m[some], lines, bands.reshape(-1, 2, 2), found,
     )  # fmt: skip
-    passed, under = found.T
     out, first = [], 0
-    for p, asked in zip(panels, low, strict=True):
-        count = p.returns.size
+    for p, low in zip(panels, asked, strict=True):
+        count, own = p.returns.size, slice(first, first + int(low.sum()))
         height = returns.height_m[p.rows]
         between = (height > p.low_m[p.stretch] + _RIM_M) & (height < p.high_m[p.stretch] - _RIM_M)
         stopped = np.bincount(p.stretch[taken[p.rows] & between], minlength=count)
-        own = slice(first, first + count) if asked else slice(0, 0)
-        none = np.zeros(0 if asked else count, np.int64)
-        out.append(replace(p, stopped=stopped, passed=np.append(passed[own], none), under=np.append(under[own], none)))
-        first += count if asked else 0
+        through = np.zeros((count, 2), np.int64)
+        through[low] = found[own]
+        out.append(replace(p, stopped=stopped, passed=through[:, 0], under=through[:, 1]))
+        first = own.stop
     return out
-
-
-def _is_low(panel: Panel) -> bool:
-    """Returns whether sight lines through a surface are counted."""
-    above = panel.high_m - panel.ground_m
-    known = above[np.isfinite(above)]
-    return known.size > 0 and float(np.median(known)) <= _HIGH_M

@@ -10,7 +10,8 @@ import pytest
 
 from roadscan.assets.kind import AssetObject, asset_kinds
 from roadscan.assets.scene import Box, Scene
-from roadscan.assets.upright.lines import PIECE_SCHEMA, STRETCHES, chains_of
+from roadscan.assets.upright.lines import PIECE_SCHEMA, STRETCHES, Chain, chains_of
+from roadscan.assets.upright.surfaces import parts_of
 from tests.assets.upright.scene import objects_of, simulated
 
 TILE_M, HALO_M = 20.0, 8.0
@@ -83,10 +84,25 @@ def test_a_chain_was_seen_by_the_passes_of_all_its_pieces() -> None:
     def piece(start_m: float, passes: list[int]) -> dict[str, object]:
         values = {name: [0.0] for name in STRETCHES} | {"high_m": [1.5], "length_m": [5.0]}
         return {
-            "x_m": [start_m, start_m + 5.0], "y_m": [0.0, 0.0], **values, "across_m": 0.01, "vegetation": 0.0,
+            "x_m": [start_m, start_m + 5.0], "y_m": [0.0, 0.0], **values, "across_m": 0.01,
             "sensor_x_m": 0.0, "sensor_y_m": 9.0, "seen": 100, "passes": passes,
             "first_epoch_gps_ns": passes[0], "last_epoch_gps_ns": passes[-1],
         }  # fmt: skip
 
     (chain,) = chains_of(pa.Table.from_pylist([piece(0.0, [1, 2]), piece(5.0, [2, 3])], schema=PIECE_SCHEMA))
     assert (len(chain.passes), chain.seen, chain.epochs_gps_ns) == (3, 200, (1, 3))
+
+
+@pytest.mark.parametrize(("passed", "name"), [(20.0, "fence"), (0.0, "barrier")])
+def test_a_house_and_what_goes_on_in_its_line_are_two_things(passed: float, name: str) -> None:
+    """Eight metres of a house of 6 m, then four metres of 1.1 m that let half of the sight lines pass, or none."""
+    house, low = np.full(8, 1.0), np.full(4, 1.0)
+    values = {
+        "ground_m": np.zeros(12), "low_m": np.full(12, 0.1), "bulk_m": np.full(12, 0.2), "length_m": np.ones(12),
+        "high_m": np.concatenate([6.0 * house, 1.1 * low]), "returns": np.full(12, 50.0), "stopped": np.full(12, 20.0),
+        "passed": np.concatenate([0.0 * house, passed * low]), "under": np.zeros(12), "open_top": np.zeros(12),
+        "leaves": np.zeros(12),
+    }  # fmt: skip
+    line = np.column_stack([np.arange(13.0), np.zeros(13)])
+    chain = Chain(line, values, 0.02, (0.0, 9.0), 600, frozenset({1}), (0, 1))
+    assert parts_of(chain) == [("facade", 0, 8), (name, 8, 12)]

@@ -1,0 +1,92 @@
+"""Fences and walls on hard streets, metre by metre: found, told right, and what is named a fence elsewhere.
+
+A metre counts where 15 returns or more show it, and most returns at its place are its own. The streets of `SCORED` were
+never looked at; limits of upright surfaces were set while those of `SEEN` were.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+import shapely
+
+from benchmarks.hard_streets import hard_street
+from benchmarks.judged_scenes import in_window
+from benchmarks.labelled_returns import LabelledReturns, labelled_returns
+from benchmarks.timing import Figure
+from roadscan.assets import classes
+from roadscan.assets.kind import asset_kinds
+from roadscan.assets.make_scene import make_scene
+from roadscan.assets.scene import Scene
+from roadscan.simulate import Scene as Street
+
+Float64 = npt.NDArray[np.float64]
+
+SEEN: Final = range(800, 807)
+SCORED: Final = (807, 808, 811, 813, 819, 822)
+"""Seeds of hard streets: three with an HDL-32E, a VLP-16 and an OS1-128 each, two with an HDL-64E and an XT32."""
+_LEAST: Final = 15  # Returns of a metre that is judged.
+_BESIDE_M, _BEFORE_M, _STEP_M = 0.35, 0.6, 0.5
+"""A line is found that lies so far beside a place and so far before or beyond it; lines are points so far apart (m)."""
+_LOWEST_M: Final = 0.3  # Returns higher above bare earth (m) show a fence; walls are judged from 0.55 m on.
+
+
+def figures(folder: Path) -> Iterator[Figure]:
+    """Shares of the length, of the streets that were looked at and of those that were only scored."""
+    for name, seeds in (("looked at", SEEN), ("only scored", SCORED)):
+        total = sum((metres_of(hard_street(seed)) for seed in seeds), np.zeros(7))
+        fences, found, walls, told, named, right, lost = total
+        yield Figure(f"{name}: {fences:.0f} m of fences, found", found / fences, "")
+        yield Figure(f"{name}: {named:.0f} m named fence, right", right / named, "")
+        yield Figure(f"{name}: {walls:.0f} m of walls and panels, found solid", told / walls, "")
+        yield Figure(f"{name}: {fences:.0f} m of fences, classed as vehicles for the most part", lost / fences, "")
+
+
+def metres_of(street: Street) -> Float64:
+    """Metres (7,): fences, found as such, walls, found solid; named fence, right; fences whose returns are vehicles."""
+    seen = labelled_returns(street)
+    inside, window, station, offset = in_window(seen, street)
+    scene = make_scene(seen.returns.at(inside), window, window, seen.drive_xyh_m)
+    lines = {kind: _places(scene, seen, kind) for kind in ("fence", "wall", "barrier", "facade")}
+    own = np.isin(seen.kind[inside], [i for i, k in enumerate(seen.kinds) if k in ("fence", "gate", "wall")])
+    side, high = street.roadside, scene.above_ground_m > _LOWEST_M
+    out = np.zeros(7)
+    for one in (*side.fences, *(w for w in side.walls if w.height_m >= 0.55)):
+        is_porous = getattr(one, "style", "panels") != "panels"
+        for metre in np.arange(max(one.start_m, 0.0) + 0.5, min(one.end_m, street.length_m)):
+            band = (np.abs(station - metre) < 0.5) & (np.abs(offset - one.offset_m) < _LOWEST_M) & high
+            if own[band].sum() < max(_LEAST, 0.5 * band.sum()):
+                continue
+            near = {kind: _near(places, metre, one.offset_m) for kind, places in lines.items()}
+            if is_porous:
+                vehicles = (scene.classes[band] == classes.VEHICLE).mean() > 0.5
+                out += [1, near["fence"], 0, 0, 0, 0, vehicles]
+            else:
+                out += [0, 0, 1, near["wall"] or near["barrier"] or near["facade"], 0, 0, 0]
+    for at, beside in lines["fence"].T:
+        if 0.0 <= at <= street.length_m:
+            right = any(f.style != "panels" and abs(beside - f.offset_m) < _BESIDE_M
+                        and f.start_m - _BEFORE_M <= at <= f.end_m + _BEFORE_M for f in side.fences)  # fmt: skip
+            out[4:6] += _STEP_M, _STEP_M * right
+    return out
+
+
+def _places(scene: Scene, seen: LabelledReturns, name: str) -> Float64:
+    """Stations and offsets (2, n) along the lines of a kind."""
+    kind = asset_kinds()[name]
+    parts = [np.zeros((2, 0))]
+    for one in kind.objects(kind.evidence(scene, None).pieces, None, {}):
+        flat = shapely.force_2d(one.geometry)
+        line = flat if "Line" in flat.geom_type else flat.exterior
+        at = shapely.line_interpolate_point(line, np.arange(_STEP_M / 2, line.length, _STEP_M))
+        parts.append(np.stack(seen.surface.station_offset_m(*shapely.get_coordinates(at).T.copy())))
+    return np.concatenate(parts, axis=1)
+
+
+def _near(places: Float64, station_m: float, offset_m: float) -> bool:
+    beside = np.abs(places - np.array([[station_m], [offset_m]]))
+    return bool(((beside[0] < _BEFORE_M) & (beside[1] < _BESIDE_M)).any())

@@ -13,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from roadscan.core.gpstime import NS_PER_S
@@ -28,6 +29,10 @@ from roadscan.store.store import Store, count_put
 
 BUDGET_BYTES: Final = 128 << 20
 """Bytes of rows in memory before the fullest partitions are written."""
+
+_LATE_NS: Final = 50_000_000
+"""Rows of so much time at the end of a partition stay in memory while more may come: stamps of a log jitter, and a few
+rows that come late would make a whole partition be merged."""
 
 
 @dataclass
@@ -86,7 +91,7 @@ class LogWriter:
             self._held += part.nbytes
         self.rows[schema.rows_of] += rows.num_rows
         while self._held > BUDGET_BYTES:
-            self._flush(max(self._bins, key=lambda k: self._bins[k].bytes))
+            self._flush(max(self._bins, key=lambda k: self._bins[k].bytes), may_go_on=True)
         return faults
 
     def reject(self, file: str, record: int, offset: int, records: int, reason: str) -> None:
@@ -164,14 +169,19 @@ class LogWriter:
             }
         return out
 
-    def _flush(self, key: tuple[str, int]) -> None:
+    def _flush(self, key: tuple[str, int], *, may_go_on: bool = False) -> None:
+        """Write the rows of a partition; the latest of them stay where more may come."""
         held = self._bins[key]
         if not held.batches:
             return
         table, start = key
-        rows = pa.Table.from_batches(held.batches)
+        rows, late = pa.Table.from_batches(held.batches), None
+        if may_go_on:
+            rows, late = _parted(table_schema(table), rows)
         self._held -= held.bytes
-        held.batches, held.bytes = [], 0
+        held.batches = [] if late is None else [late]
+        held.bytes = 0 if late is None else late.nbytes
+        self._held += held.bytes
         held.parts.append(self._write(table, start, len(held.parts), rows))
 
     def _merge(self, table: str, start: int, held: _Bin) -> list[tuple[Path, int, int]]:
@@ -265,6 +275,21 @@ def _by_bin(schema: TableSchema, rows: pa.RecordBatch) -> list[tuple[int, pa.Rec
         return [(first * schema.partition_s, rows)]
     starts = epochs // bin_ns * schema.partition_s
     return [(int(s), rows.filter(pa.array(starts == s))) for s in np.unique(starts)]
+
+
+def _parted(schema: TableSchema, rows: pa.Table) -> tuple[pa.Table, pa.RecordBatch | None]:
+    """Return rows without the latest ones, in order, and a copy of these; None where none is earlier."""
+    if schema.partition_s is None:
+        return rows, None
+    ordered = sorted_rows(schema, rows)
+    epochs = ordered.column("epoch_gps_ns")
+    latest = pc.greater(epochs, pa.scalar(epochs[-1].as_py() - _LATE_NS, epochs.type))
+    count = ordered.num_rows - int(pc.sum(latest).as_py())
+    if count == 0:
+        return rows, None
+    # A slice would keep all rows in memory.
+    late = ordered.slice(count).take(pa.array(np.arange(ordered.num_rows - count))).combine_chunks()
+    return ordered.slice(0, count), late.to_batches()[0]
 
 
 def _overlap(parts: list[tuple[Path, int, int]]) -> bool:

@@ -99,6 +99,21 @@ def test_parts_of_a_partition_that_overlap_are_merged(store: Store, monkeypatch:
     assert found.select(expected.column_names).cast(expected.schema).equals(expected)
 
 
+def test_stamps_that_jitter_make_no_partition_be_merged(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("roadscan.store.writer.BUDGET_BYTES", 40_000)
+    monkeypatch.setattr("roadscan.store.writer.merged", lambda *_: pytest.fail("a partition was merged"))
+    rng = np.random.default_rng(2)
+    epochs = START * NS_PER_S + np.arange(9000, dtype=np.int64) * 1_000_000 + rng.integers(-9_000_000, 9_000_000, 9000)
+    batches = [returns(part) for part in np.split(np.maximum(epochs, START * NS_PER_S), 90)]
+    files = write(store, batches)["returns"]
+    assert len(files) > 5
+    assert all(a.span[1] <= b.span[0] for a, b in itertools.pairwise(files))  # type: ignore[operator,index]
+    found = pa.concat_tables([read_stored(store, f) for f in files]).column("epoch_gps_ns").to_numpy()
+    np.testing.assert_array_equal(
+        found, np.sort(np.concatenate([b.column("epoch_gps_ns").to_numpy() for b in batches]))
+    )
+
+
 def test_merged_rows_of_equal_epochs_keep_the_order_of_their_files(tmp_path: Path) -> None:
     """A stable sort of all rows by Arrow is the oracle."""
     rng = np.random.default_rng(1)

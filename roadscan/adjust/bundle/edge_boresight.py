@@ -1,8 +1,8 @@
 """The boresight that range edges show: the turn at which the scores of all pictures are best, its σ, and its rows.
 
-σ is that of the mean of the pictures (sandwich estimator; White 1982): the scatter of the slopes of their scores at the best
-turn, over the curvature of the sum. Pictures near one another see the same things, so those two apart count as dependent
-(Newey & West 1987). Where another turn is as good, or the sum is flat, edges do not tell.
+σ is that of the mean of the pictures (sandwich estimator; White 1982): the scatter of the slopes of their scores at the
+best turn, over the curvature of the sum. Pictures near one another see the same things, so those two apart count as
+dependent (Newey & West 1987). Where another turn is as good, or the sum is flat, edges do not tell.
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from roadscan.adjust.adjustment import Adjustment
 from roadscan.adjust.bundle.depths import Surfaces, depth_rows
+from roadscan.adjust.bundle.edge_boresight import EdgeBoresight
 from roadscan.adjust.bundle.measurements import Measurements, State, met_at, residuals_px, seen
 from roadscan.adjust.bundle.solve import Approached, PictureEvidence, state_of
 from roadscan.adjust.control.control import ControlPoint
@@ -83,6 +84,8 @@ class PictureOutcome:
     """Distances from surfaces of lidars; None where there are none."""
     moving: int = 0
     """Tie points that lidars saw elsewhere."""
+    edges: tuple[EdgeBoresight, ...] = ()
+    """What range edges say of boresights."""
 
     def rms_px(self, *, after: bool) -> float:
         """Returns the root mean square of each coordinate of tie points, each counting by its weight."""
@@ -119,6 +122,7 @@ def outcome_of(approach: Approached, adjusted: Adjustment, points: Sequence[Cont
     return PictureOutcome(
         measured, before, after, np.where(pictures.enters, weight, np.nan), tuple(control), names, approach.sigma_px,
         squares / degrees, (low, high), pictures.notes, _depths(approach, adjusted, state), int(approach.moving.size),
+        pictures.edges,
     )  # fmt: skip
 
 

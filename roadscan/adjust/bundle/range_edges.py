@@ -2,8 +2,8 @@
 
 Where one return is much nearer than its neighbour, there is an edge of the nearer thing, and most often of the picture
 (Levinson & Thrun 2013, *Automatic online calibration of cameras and lasers*). Neighbours are those of a Delaunay
-triangulation of the directions from the lidar, so nothing need be known of its lasers; the edge lies midway between the two,
-at the range of the nearer one. A score is the sum, over edges, of the contrast of the picture across the edge's own
+triangulation of the directions from the lidar, so nothing need be known of its lasers; the edge lies midway between the
+two, at the range of the nearer one. A score is the sum, over edges, of the contrast of the picture across the edge's own
 direction, relative to that of its surroundings. Returns of the moment of a picture are used: what moves is where the
 picture shows it.
 """
@@ -38,8 +38,8 @@ _APART_DEG: Final = 1.6
 _JUMP_M, _JUMP = 0.5, 0.1
 """An edge is a leap of the range by this (m), and by this share of it; less is relief."""
 _STEP, _FULL = 0.08, 0.4
-"""Least share by which the inverse depth of neither side goes on to the other one, and that from which on an edge counts
-fully."""
+"""Least share by which the inverse depth of neither side goes on to the other one, and that from which on an edge
+counts fully."""
 _BLUR_DEG: Final = 0.08
 """1 σ of an edge beside the distance of its returns (degrees): the width of beams, of 0.1 to 0.2°."""
 _PIXEL_DEG: Final = 0.1
@@ -126,7 +126,7 @@ def responses(picture: UInt8, lens: Lens) -> tuple[Float32, float, float]:
     height, width = picture.shape
     focal = float(lens.parameters[:2].mean())
     step = max(1.0, np.radians(_PIXEL_DEG) * focal)
-    size = (max(int(round(width / step)), 8), max(int(round(height / step)), 8))
+    size = (max(round(width / step), 8), max(round(height / step), 8))
     small = picture.astype(np.float32)
     small = cv2.resize(small, size, interpolation=cv2.INTER_AREA) if step > 1.0 else small
     small = cv2.GaussianBlur(small, (0, 0), 1.0)
@@ -178,8 +178,6 @@ def scores_of(
     own = across / lens.parameters[:2]
     by_place, by_turn = np.einsum("mi,mij->mj", own, by_point), np.einsum("mi,mij->mj", own, slope)
     in_body, away = by_place @ axes.T, point @ axes.T + lever - lidar_body_m
-    others = np.concatenate(
-        [-in_body, in_body, np.cross(away, in_body), np.einsum("mi,mij->mj", own, by_lens)], axis=1
-    )
+    others = np.concatenate([-in_body, in_body, np.cross(away, in_body), np.einsum("mi,mij->mj", own, by_lens)], axis=1)
     weighted = by_turn * weight[:, None]
     return EdgeScores(len(point), score, weighted.T @ by_turn, weighted.T @ others)

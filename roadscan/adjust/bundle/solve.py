@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from roadscan.adjust.adjustment import Adjustment, adjust
 from roadscan.adjust.bundle.depths import DepthRows, NearReturns, Surfaces, depth_rows, surfaces_of
+from roadscan.adjust.bundle.edge_boresight import EdgeBoresight
 from roadscan.adjust.bundle.measurements import (
     Measurements,
     Numbers,
@@ -77,6 +78,13 @@ class PictureEvidence:
     """What lidars saw about tie points."""
     depth_sigma_m: tuple[float, float] = (0.03, 0.01)
     """1 σ of the distance of a tie point from a surface of the lidar, and of what all of a picture are off (m)."""
+    edges: tuple[EdgeBoresight, ...] = ()
+    """What range edges say of boresights."""
+
+    def at_start(self) -> State:
+        """Returns the state from which solutions begin: cameras turned as range edges show them."""
+        told = [one for one in reversed(self.edges) if not one.why_not and one.of.camera_seat >= 0]
+        return State(mountings={one.of.camera_seat: np.array([0.0, 0.0, 0.0, *one.turn, 0.0]) for one in told})
 
 
 @dataclass(frozen=True)
@@ -138,7 +146,7 @@ def approached(
     first = places(pictures, others[1])
     quiet = settings.model_copy(update={"estimate_variance_components": False, "max_rounds": _ROUNDS})
     priors = [one.faster(_FASTER, _FASTER) for one in priors]
-    state, weight, heavy = State(), _at_start(pictures), 1.0
+    state, weight, heavy = pictures.at_start(), _at_start(pictures), 1.0
     before, settled = np.zeros((0, 2)), False
     surfaces: Surfaces | None = None
     depths: DepthRows | None = None
@@ -280,7 +288,7 @@ def _weights(
 def _at_start(pictures: PictureEvidence) -> Float64:
     """Returns weights (m,): 0 of measurements that pass their point by far more than the others do."""
     measured = pictures.measured
-    weight, where = pictures.enters.astype(np.float64), seen(measured, State(), pictures.numbers)
+    weight, where = pictures.enters.astype(np.float64), seen(measured, pictures.at_start(), pictures.numbers)
     for _ in range(2):
         away = _lengths_px(measured, where, weight)
         known = (weight > 0.0) & measured.is_tie & np.isfinite(away)

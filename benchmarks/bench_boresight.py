@@ -2,9 +2,9 @@
 
 python -m benchmarks.bench_boresight FOLDER [ROLL PITCH HEADING] [--half 0 | 1] [--street]
 
-Turns the stated boresight of `colour_and_lidar` (with --street: of `semantic_kitti_00`) by these angles about the axes of the
-body (degrees; 1 −1 1 where not given), runs the survey up to the adjustment and prints what is left against the published
-mounting. --half takes every second picture alone.
+Turns the stated boresight of `colour_and_lidar` (with --street: of `semantic_kitti_00`) by these angles about the axes
+of the body (degrees; 1 −1 1 where not given), runs the survey up to the adjustment and prints what is left against the
+published mounting. --half takes every second picture alone.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import csv
 import os
 import resource
 import shutil
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -66,7 +67,7 @@ def turned(file: Path, off_deg: Float64) -> None:
     path = file.parent / "rig.toml"
     lines = path.read_text().splitlines()
     at = next(k for k, line in enumerate(lines) if line.startswith("body_from_sensor"))
-    stated = np.array(eval(lines[at].partition("=")[2]))  # noqa: S307 - a list that this module wrote
+    stated = np.array(tomllib.loads(lines[at])["body_from_sensor"])
     off = Rotation.from_rotvec(off_deg, degrees=True).as_matrix() @ stated
     lines[at] = f"body_from_sensor = {off.tolist()}"
     path.write_text("\n".join(lines) + "\n")

@@ -86,6 +86,10 @@ class PictureOutcome:
     """Tie points that lidars saw elsewhere."""
     edges: tuple[EdgeBoresight, ...] = ()
     """What range edges say of boresights."""
+    against_edges: float = 0.0
+    """By how many σ they contradicted tie points, until these counted less; 0 where they agree."""
+    shared_px: float = 0.0
+    """1 σ of what the tie points of a picture are off in common (px), as they entered."""
 
     def rms_px(self, *, after: bool) -> float:
         """Returns the root mean square of each coordinate of tie points, each counting by its weight."""
@@ -122,7 +126,7 @@ def outcome_of(approach: Approached, adjusted: Adjustment, points: Sequence[Cont
     return PictureOutcome(
         measured, before, after, np.where(pictures.enters, weight, np.nan), tuple(control), names, approach.sigma_px,
         squares / degrees, (low, high), pictures.notes, _depths(approach, adjusted, state), int(approach.moving.size),
-        pictures.edges,
+        pictures.edges, approach.against_edges, pictures.shared_px,
     )  # fmt: skip
 
 

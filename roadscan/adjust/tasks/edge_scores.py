@@ -208,8 +208,8 @@ def boresight_findings(found: Sequence[EdgeBoresight]) -> list[Finding]:
             within = ", ".join(f"{s:.2g}" for s in np.degrees(stated))
             where = f"edges of {one.of.lidar} lie on those of {counted(one.pictures, 'picture')}"
             text = (
-                f"{where} if the camera is turned by {_angles(one)}; its boresight is stated to {within}°. Correct the rig "
-                "file, or calibrate the camera anew"
+                f"{where} if the camera is turned by {_angles(one)}; its boresight is stated to {within}°. Correct the "
+                "rig file, or calibrate the camera anew"
             )
             said.append(PICTURE_EDGES.finds(one.of.camera, text))
     return said

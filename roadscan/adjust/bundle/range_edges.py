@@ -3,9 +3,9 @@
 Where one return is much nearer than its neighbour, there is an edge of the nearer thing, and most often of the picture
 (Levinson & Thrun 2013, *Automatic online calibration of cameras and lasers*). Neighbours are those of a Delaunay
 triangulation of the directions from the lidar, so nothing need be known of its lasers; the edge lies midway between the
-two, at the range of the nearer one. A score is the sum, over edges, of the contrast of the picture across the edge's own
-direction, relative to that of its surroundings. Returns of the moment of a picture are used: what moves is where the
-picture shows it.
+two, at the range of the nearer one. A score is the sum, over edges, of the contrast of the picture across the edge,
+relative to that of its surroundings. Returns of the moment of a picture are used: what moves is where the picture
+shows it.
 """
 
 from __future__ import annotations

@@ -179,5 +179,7 @@ def scores_of(
     by_place, by_turn = np.einsum("mi,mij->mj", own, by_point), np.einsum("mi,mij->mj", own, slope)
     in_body, away = by_place @ axes.T, point @ axes.T + lever - lidar_body_m
     others = np.concatenate([-in_body, in_body, np.cross(away, in_body), np.einsum("mi,mij->mj", own, by_lens)], axis=1)
+    # Not by matrix products: their sums over many rows depend on how many threads the linear algebra has.
     weighted = by_turn * weight[:, None]
-    return EdgeScores(len(point), score, weighted.T @ by_turn, weighted.T @ others)
+    normal, joint = (np.einsum("mi,mj->ij", weighted, own) for own in (by_turn, others))
+    return EdgeScores(len(point), score, normal, joint)

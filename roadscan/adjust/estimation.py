@@ -106,7 +106,7 @@ class Rounds:
         self.problem, self.settings = problem, settings
         self._estimating = bool(settings.estimate_variance_components)
         self._surveyed = problem.kind == SURVEY
-        self._tied = problem.kind == KINDS.index("picture_tie")
+        self._tied = np.isin(problem.kind, [KINDS.index("picture_tie"), KINDS.index("picture_edge")])
         self._survey_weight = np.zeros(int(self._surveyed.sum()))
         self._observed = problem.observed.copy()
         self._row, self._column, self._value, self._component = problem.unknowns.prior_entries()

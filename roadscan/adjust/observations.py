@@ -34,12 +34,12 @@ UInt8 = npt.NDArray[np.uint8]
 
 KINDS: Final = (
     "height_tie", "shift_tie", "plane_tie", "control_height", "control_position", "head_tie", "hand_tie",
-    "picture_tie", "picture_control", "picture_depth",
+    "picture_tie", "picture_control", "picture_depth", "picture_edge",
 )  # fmt: skip
 """Height of one pass against another's; shift of one image or relief against another's; distance of two planes;
 height, or a component of the place, of a control point; height of one head against that of another of the same pass;
 what a person found in two passes; column or row of a tie point, or of a control point, in a picture; distance of a
-tie point from a surface that a lidar saw."""
+tie point from a surface that a lidar saw; turn of a camera that range edges of a lidar show (rad)."""
 
 COMPONENTS: Final = ("north_m", "east_m", "down_m", "roll_rad", "pitch_rad", "heading_rad")
 """The unknowns of a pose, in the order of the partial derivatives."""

@@ -35,7 +35,7 @@ class Adjust(Stage):
         "mountings", "footprints", "picture_tracks", "images",
     )  # fmt: skip
     writes = (
-        "ties", "control_sightings", "tie_returns", *TABLES, "corrections", "mounting_corrections",
+        "ties", "control_sightings", "tie_returns", "edge_scores", *TABLES, "corrections", "mounting_corrections",
         "camera_corrections", "camera_covariances",
     )  # fmt: skip
 
@@ -88,5 +88,7 @@ class Adjust(Stage):
 
     def folders(self) -> Sequence[str]:
         """Returns folders: evidence, tables of the outcome, pictures."""
-        locations = [table_schema(name).location for name in ("ties", "control_sightings", "tie_returns", *TABLES)]
+        locations = [
+            table_schema(name).location for name in ("ties", "control_sightings", "tie_returns", "edge_scores", *TABLES)
+        ]
         return [*(location for location in locations if location is not None), FOLDER]

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from roadscan.adjust.adjustment import Adjustment
 from roadscan.adjust.bundle.depths import Surfaces, depth_rows
+from roadscan.adjust.bundle.edge_boresight import EdgeBoresight
 from roadscan.adjust.bundle.measurements import Measurements, State, met_at, residuals_px, seen
 from roadscan.adjust.bundle.solve import Approached, PictureEvidence, state_of
 from roadscan.adjust.control.control import ControlPoint
@@ -83,6 +84,12 @@ class PictureOutcome:
     """Distances from surfaces of lidars; None where there are none."""
     moving: int = 0
     """Tie points that lidars saw elsewhere."""
+    edges: tuple[EdgeBoresight, ...] = ()
+    """What range edges say of boresights."""
+    against_edges: float = 0.0
+    """By how many σ they contradicted tie points, until these counted less; 0 where they agree."""
+    shared_px: float = 0.0
+    """1 σ of what the tie points of a picture are off in common (px), as they entered."""
 
     def rms_px(self, *, after: bool) -> float:
         """Returns the root mean square of each coordinate of tie points, each counting by its weight."""
@@ -119,6 +126,7 @@ def outcome_of(approach: Approached, adjusted: Adjustment, points: Sequence[Cont
     return PictureOutcome(
         measured, before, after, np.where(pictures.enters, weight, np.nan), tuple(control), names, approach.sigma_px,
         squares / degrees, (low, high), pictures.notes, _depths(approach, adjusted, state), int(approach.moving.size),
+        pictures.edges, approach.against_edges, pictures.shared_px,
     )  # fmt: skip
 
 

@@ -45,5 +45,10 @@ class CameraPriors(Strict):
     """1 σ of the distance of a tie point from such a surface, beside the scatter of the returns (m)."""
     sigma_shared_depth_m: float = Field(default=0.01, ge=0.0, le=1.0)
     """1 σ of what all of them in a picture are off in common (m): ranges that depend on brightness, and beams."""
+    edges: bool = True
+    """Whether range edges of a lidar of the same run, held against edges of pictures, are an observation of the
+    boresight."""
+    sigma_shared_edge_deg: float = Field(default=0.05, gt=0.0, le=5.0)
+    """1 σ of what all range edges are off in common (degrees), about each axis: beams are 0.1 to 0.2° wide."""
     sigma_control_px: float = Field(default=0.3, gt=0.0, le=10.0)
     """1 σ of each pixel coordinate of a control point, where the measurement states none (px)."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from roadscan.adjust.adjustment import Adjustment, adjust
 from roadscan.adjust.bundle.depths import DepthRows, NearReturns, Surfaces, depth_rows, surfaces_of
+from roadscan.adjust.bundle.edge_boresight import KIND, EdgeBoresight
 from roadscan.adjust.bundle.measurements import (
     Measurements,
     Numbers,
@@ -22,7 +23,7 @@ from roadscan.adjust.bundle.measurements import (
     rows_of,
     seen,
 )
-from roadscan.adjust.observations import Observations
+from roadscan.adjust.observations import KINDS, Observations
 from roadscan.adjust.process import CameraPrior, MountingPrior, RunPrior
 from roadscan.adjust.solver_settings import AdjustmentSettings
 from roadscan.adjust.weights import igg_iii
@@ -54,6 +55,12 @@ _LOOKS: Final = 5
 _ELSEWHERE_M: Final = 0.5
 """A tie point farther than this from a surface that the lidar saw there (m) is of something that moves …"""
 _ELSEWHERE: Final = 6.0  # … if that is so many σ as well.
+_CONTRADICTS: Final = 3.0
+"""Range edges contradict tie points beyond so many σ."""
+_SOFTER: Final = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
+"""Factors of what the tie points of a picture are off in common that are tried then, until 1 σ is left."""
+_LEAST_SHARED_PX: Final = 0.01
+"""They multiply this at least (px)."""
 _GROSS: Final = 12.0
 """At the start, a measurement farther than so many median residuals from its point is left out."""
 
@@ -77,6 +84,13 @@ class PictureEvidence:
     """What lidars saw about tie points."""
     depth_sigma_m: tuple[float, float] = (0.03, 0.01)
     """1 σ of the distance of a tie point from a surface of the lidar, and of what all of a picture are off (m)."""
+    edges: tuple[EdgeBoresight, ...] = ()
+    """What range edges say of boresights."""
+
+    def at_start(self) -> State:
+        """Returns the state from which solutions begin: cameras turned as range edges show them."""
+        told = [one for one in reversed(self.edges) if not one.why_not and one.of.camera_seat >= 0]
+        return State(mountings={one.of.camera_seat: np.array([0.0, 0.0, 0.0, *one.turn, 0.0]) for one in told})
 
 
 @dataclass(frozen=True)
@@ -101,6 +115,8 @@ class Approached:
     """(m,) weight of the depth at each measurement."""
     moving: Int64
     """Numbers of the tie points that lidars saw elsewhere, as things that move, and which do not count."""
+    against_edges: float = 0.0
+    """By how many σ range edges contradicted tie points, until these counted less; 0 where they agree."""
 
 
 def state_of(found: Adjustment) -> State:
@@ -137,8 +153,8 @@ def approached(
     """
     first = places(pictures, others[1])
     quiet = settings.model_copy(update={"estimate_variance_components": False, "max_rounds": _ROUNDS})
-    priors = [one.faster(_FASTER, _FASTER) for one in priors]
-    state, weight, heavy = State(), _at_start(pictures), 1.0
+    stated, priors = priors, [one.faster(_FASTER, _FASTER) for one in priors]
+    state, weight, heavy = pictures.at_start(), _at_start(pictures), 1.0
     before, settled = np.zeros((0, 2)), False
     surfaces: Surfaces | None = None
     depths: DepthRows | None = None
@@ -164,10 +180,10 @@ def approached(
         lengths, root = _judged(pictures, rows, found, others[0].size + more.size)
         limits = settings.full_weight_within * wide, settings.reject_beyond * wide
         if surfaces is not None and depths is not None:
-            off = _off_surfaces(depths, found, others[0].size)
+            away = _off_surfaces(depths, found, others[0].size)
             depth_weight = np.ones(depth_weight.size)
-            depth_weight[surfaces.measurement[depths.surface]] = igg_iii(off[1], *limits)
-            moving = _moving(pictures.measured.point[surfaces.measurement[depths.surface]], off)
+            depth_weight[surfaces.measurement[depths.surface]] = igg_iii(away[1], *limits)
+            moving = _moving(pictures.measured.point[surfaces.measurement[depths.surface]], away)
         weight, factor = _weights(pictures, state, (lengths, weight), limits)
         heavy = max(heavy * root / factor, 1.0) if number > _WIDE.size else 1.0
         pictures = _with_sigma(pictures, factor)
@@ -180,8 +196,40 @@ def approached(
         depths = _depths(pictures, surfaces, state, (place_m, first), depth_weight)
     entered = np.isin(np.arange(weight.size), rows.measurement)
     weight = np.where(entered, weight, 0.0)
+    more = Observations.none() if depths is None else depths.observations
+    beside = Observations.joined([others[0], more])
+    shared_px, off = _shared(pictures, (beside, rows, weight), lambda all_rows: adjust(
+        all_rows, stated, quiet, mountings, pictures.cameras
+    ))  # fmt: skip
+    pictures = replace(pictures, shared_px=shared_px)
     rows = sharing(rows, pictures, weight)
-    return Approached(pictures, rows, weight, sigma, others, surfaces, depths, depth_weight, moving)
+    return Approached(pictures, rows, weight, sigma, others, surfaces, depths, depth_weight, moving, off)
+
+
+def _shared(
+    pictures: PictureEvidence, parts: tuple[Observations, Rows, Float64], solved: Callable[[Observations], Adjustment]
+) -> tuple[float, float]:
+    """Returns 1 σ (px) of what the tie points of a picture are off in common, and by how many σ range edges contradict
+    them as it is stated, 0 where they do not.
+
+    Edges hold whatever moves, and whatever the poses; tie points do not. So where the two contradict, tie points are
+    off in common by more than is stated.
+
+    Parameters
+    ----------
+    parts : all other observations, rows of the pictures, and weights of their measurements.
+    """
+    beside, rows, weight = parts
+    edges, first = np.flatnonzero(beside.kind == KINDS.index(KIND)), 0.0
+    for factor in _SOFTER if edges.size else ():
+        softer = replace(pictures, shared_px=max(pictures.shared_px, _LEAST_SHARED_PX) * factor)
+        joined = Observations.joined([beside, sharing(rows, softer, weight).observations])
+        off = float(np.nan_to_num(np.abs(solved(joined).normalised_residual[edges])).max())
+        first = first or off
+        if off <= (_CONTRADICTS if factor == 1.0 else 1.0):
+            break
+    contradicted = first > _CONTRADICTS
+    return (softer.shared_px, first) if contradicted else (pictures.shared_px, 0.0)
 
 
 def _depths(
@@ -280,7 +328,7 @@ def _weights(
 def _at_start(pictures: PictureEvidence) -> Float64:
     """Returns weights (m,): 0 of measurements that pass their point by far more than the others do."""
     measured = pictures.measured
-    weight, where = pictures.enters.astype(np.float64), seen(measured, State(), pictures.numbers)
+    weight, where = pictures.enters.astype(np.float64), seen(measured, pictures.at_start(), pictures.numbers)
     for _ in range(2):
         away = _lengths_px(measured, where, weight)
         known = (weight > 0.0) & measured.is_tie & np.isfinite(away)

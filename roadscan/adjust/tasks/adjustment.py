@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, NamedTuple
 
@@ -18,7 +18,7 @@ from roadscan.adjust.places import Place, Track, places_of_overlap
 from roadscan.adjust.process import RunPrior
 from roadscan.adjust.quality import NSSDA_CHECK_POINTS
 from roadscan.adjust.settings import AdjustConfig
-from roadscan.adjust.tasks.bundle import pictures_key, pictures_of
+from roadscan.adjust.tasks.bundle import AskedOfPictures, pictures_key, pictures_of
 from roadscan.adjust.tasks.camera_priors import asks_pictures
 from roadscan.adjust.tasks.cameras import (
     camera_findings,
@@ -37,6 +37,7 @@ from roadscan.adjust.tasks.control_work import (
     sight_control,
 )
 from roadscan.adjust.tasks.doubts import CONTROL, CONTROL_PLACE, CORRECTED_ELSEWHERE, target_findings
+from roadscan.adjust.tasks.edge_scores import SCORES
 from roadscan.adjust.tasks.failed_ties import failed_ties
 from roadscan.adjust.tasks.figures import (
     Held,
@@ -65,7 +66,7 @@ from roadscan.adjust.tasks.outcome import ADJUSTMENT, PICTURES, SOLUTION, TABLES
 from roadscan.adjust.tasks.publication import digests_of, foreign_runs, publish
 from roadscan.adjust.tasks.seams import shown_seams
 from roadscan.adjust.tasks.solution import Evidence, Solution, priors_of, solve
-from roadscan.adjust.tasks.tie_depths import RETURNS, DepthTask, write_returns
+from roadscan.adjust.tasks.tie_depths import RETURNS
 from roadscan.adjust.tasks.tie_work import TIES, KnownTies, TieTask, collect_ties, load_ties, tie_tasks
 from roadscan.adjust.tasks.ties_again import Again, first_ties, settled
 from roadscan.adjust.tasks.tracks import adjusted_sources, runs_of, tracks_of
@@ -163,7 +164,7 @@ def why_due(plan: SurveyPlan, manifest: Manifest) -> str:
         return "" if record is None else "switched off"
     if record is None or record.key != solution_key(plan, manifest):
         return MISSING if record is None else CHANGED
-    parts = [r for name in (TIES, SIGHTINGS, RETURNS, *TABLES, PICTURES) for r in manifest.of(name).values()]
+    parts = [r for name in (TIES, SIGHTINGS, RETURNS, SCORES, *TABLES, PICTURES) for r in manifest.of(name).values()]
     whole = all(manifest.is_current(r.product, r.unit, r.key) and _is_drawn(r) for r in parts)
     return "" if whole and record.figures()["table"] == digests_of(plan.store) else DAMAGED
 
@@ -176,7 +177,9 @@ def _is_drawn(record: OutputRecord) -> bool:
 def withdraw(session: Session) -> None:
     """Remove the stage's products: the recorded poses are used."""
     manifest, plan = session.manifest, poses_plan_of(session)
-    manifest.remove([r for name in (TIES, SIGHTINGS, RETURNS, *TABLES, PICTURES) for r in manifest.of(name).values()])
+    manifest.remove(
+        [r for name in (TIES, SIGHTINGS, RETURNS, SCORES, *TABLES, PICTURES) for r in manifest.of(name).values()]
+    )
     publish(session.store, {}, AdjustConfig.of(plan.survey))
     publish_mountings(session.store, None, AdjustConfig.of(plan.survey))
     publish_cameras(session.store, None)
@@ -196,9 +199,7 @@ class _Collector:
         self.of_heads, self._useless = self._heads()
         """Findings on heads that do not meet as they should."""
         plan = poses_plan_of(session)
-        self._pictures = pictures_of(
-            plan, session.manifest, self.runs, self.mounted, self.work.points, self._collect_depths
-        )
+        self._pictures = pictures_of(plan, session.manifest, self.runs, self.mounted, self.work.points, self._collect)
         tools = self.observe, self.load
         self.again = first_ties(plan, sources, self.work.ties, self.work.control, tools)
 
@@ -206,17 +207,17 @@ class _Collector:
         """Update ties."""
         self.lacks |= _collect_ties(self.session, tasks)
 
-    def _collect_depths(self, tasks: Sequence[DepthTask]) -> None:
-        """Update what lidars saw about the tie points of pictures."""
+    def _collect(self, product: str, function: Callable[[Any], OutputRecord], tasks: Sequence[AskedOfPictures]) -> None:
+        """Update what lidars say of pictures."""
         manifest = self.session.manifest
-        due = [t for t in tasks if not manifest.is_current(RETURNS, t.unit, t.key)]
+        due = [t for t in tasks if not manifest.is_current(product, t.unit, t.key)]
         ended = run_bundles(
-            write_returns, due, lambda t: sum(f.bytes for f in t.files), _BUNDLE_BYTES, manifest, self.session.compute,
-            self.session.bar("depths of tie points"),
+            function, due, lambda t: sum(f.bytes for f in t.files), _BUNDLE_BYTES, manifest, self.session.compute,
+            self.session.bar("lidar in pictures"),
         )  # fmt: skip
         self.session.failed("adjust", [(task.unit, reason) for task, reason in ended])
         self.lacks |= bool(ended)
-        manifest.remove(manifest.beside([RETURNS], {t.unit for t in tasks}))
+        manifest.remove(manifest.beside([product], {t.unit for t in tasks}))
 
     def load(self, tasks: Sequence[TieTask]) -> KnownTies:
         """Returns ties that are up to date."""

@@ -15,8 +15,9 @@ from roadscan.adjust.control.control import ControlPoint
 from roadscan.adjust.process import CameraPrior
 from roadscan.adjust.settings import AdjustConfig
 from roadscan.adjust.tasks.camera_priors import adjusted_cameras, asks_pictures, camera_sigma
+from roadscan.adjust.tasks.edge_scores import SCORES, EdgeTask, edge_tasks, load_boresights, write_scores
 from roadscan.adjust.tasks.mountings import Mounted
-from roadscan.adjust.tasks.tie_depths import DepthTask, depth_tasks, load_returns
+from roadscan.adjust.tasks.tie_depths import RETURNS, DepthTask, depth_tasks, load_returns, write_returns
 from roadscan.core.counted import listed
 from roadscan.core.ids import of_run
 from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory_source
@@ -28,12 +29,15 @@ from roadscan.pictures.frames.chosen import camera_pictures
 from roadscan.pictures.points import TABLE, measured_points
 from roadscan.pictures.ties.chains import TRACKS
 from roadscan.pictures.ties.work import ALL
-from roadscan.store.manifest import Manifest, recorded_table
+from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.store import Store
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]
 
+AskedOfPictures = DepthTask | EdgeTask
+Collect = Callable[[str, Callable[[Any], OutputRecord], Sequence[AskedOfPictures]], None]
+"""Updates the files of a product: its name, the function that writes one, and the tasks."""
 _NAMED: Final = 5  # Names that a note lists.
 _START_PX: Final = 0.5
 """1 σ of a tie point (px) until its residuals show it."""
@@ -80,7 +84,7 @@ def pictures_key(plan: SurveyPlan, manifest: Manifest) -> list[Any]:
 
 def pictures_of(
     plan: SurveyPlan, manifest: Manifest, runs: Sequence[str], mounted: Mounted, points: Sequence[ControlPoint],
-    collect: Callable[[Sequence[DepthTask]], None],
+    collect: Collect,
 ) -> PictureEvidence | None:  # fmt: skip
     """Returns the evidence of a survey's pictures; None where they take no part, or show nothing.
 
@@ -89,7 +93,7 @@ def pictures_of(
     runs : by which observations number them.
     mounted : the mountings that are estimated.
     points : control points of the survey.
-    collect : updates what lidars saw about tie points.
+    collect : updates what tasks write.
     """
     if not asks_pictures(plan.survey):
         return None
@@ -125,12 +129,15 @@ def pictures_of(
         plan, exposures, (tracks.picture, tracks.pixel), priors,
         lambda sensor: float(camera_sigma(plan.survey.rig.sensors[sensor], priors)[0][3:6].max()),
     )  # fmt: skip
-    collect(tasks)
+    collect(RETURNS, write_returns, tasks)
     returns = load_returns(manifest, tasks, mounted, plan)
+    compared = edge_tasks(plan, exposures, priors)
+    collect(SCORES, write_scores, compared)
+    edges = load_boresights(manifest, compared, mounted, numbers, plan, priors)
     named = np.concatenate([np.full(tied, -1), [p.number for p in surveyed]]).astype(np.int64)
     return PictureEvidence(
         measured, numbers, cameras, named, ~is_check[measured.point], priors.sigma_shared_px, notes, returns,
-        (priors.sigma_depth_m, priors.sigma_shared_depth_m),
+        (priors.sigma_depth_m, priors.sigma_shared_depth_m), edges,
     )  # fmt: skip
 
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from roadscan.adjust.adjustment import CameraErrors
 from roadscan.adjust.bundle.outcome import ControlOfPictures, PictureOutcome
 from roadscan.adjust.bundle.self_check import FreeCameras
+from roadscan.adjust.tasks.edge_scores import BORESIGHTS, boresight_findings, boresight_lines, boresight_rows
 from roadscan.adjust.tasks.figures import Rows
 from roadscan.core.counted import counted
 from roadscan.core.witness import Finding, Witness
@@ -136,7 +137,9 @@ def picture_rows(found: PictureOutcome | None) -> dict[str, Rows]:
             }
         )  # fmt: skip
     control = [_control_row(one) for one in found.control]
-    return {"picture_residuals": rows, "picture_control": control, "depth_residuals": list(_depth_rows(found))}
+    edges = boresight_rows(found.edges)
+    depths = list(_depth_rows(found))
+    return {"picture_residuals": rows, "picture_control": control, "depth_residuals": depths, BORESIGHTS: edges}
 
 
 def _depth_rows(found: PictureOutcome) -> Iterator[dict[str, Any]]:
@@ -168,18 +171,28 @@ def _finite(value: float) -> float | None:
 
 
 def picture_findings(found: PictureOutcome | None) -> list[Finding]:
-    """Returns a finding where pictures do not fit to one another, whatever the poses."""
-    if found is None or not found.measured.is_tie.any():
+    """Returns findings where pictures do not fit to one another, whatever the poses, and not to edges of lidars."""
+    if found is None:
         return []
+    edges = boresight_findings(found.edges)
+    if found.against_edges:
+        said = (
+            f"range edges of lidars contradict tie points by {found.against_edges:.1f} σ: these are of things that "
+            "move, or the poses are off by more than is stated; tie points count as if those of a picture were off by "
+            f"{found.shared_px:.2g} px in common"
+        )
+        edges.append(PICTURE_FIT.finds("pictures", said))
+    if not found.measured.is_tie.any():
+        return edges
     tie = found.measured.is_tie
     share, left = float((found.weight[tie] > 0.0).mean()), found.rms_px(after=True)
     if share >= _LEAST_SHARE and left <= _MOST_PX:
-        return []
+        return edges
     said = (
         f"{share:.0%} of the measurements of tie points agree with one another, to {left:.2f} px: of right stamps, "
         f"lens and mounting it is {_LEAST_SHARE:.0%} or more, to {_MOST_PX:g} px; corrections of the poses rest on them"
     )
-    return [PICTURE_FIT.finds("pictures", said)]
+    return [PICTURE_FIT.finds("pictures", said), *edges]
 
 
 def camera_findings(free: FreeCameras | None) -> list[Finding]:
@@ -266,7 +279,7 @@ def picture_lines(found: PictureOutcome | None, cameras: CameraErrors | None, fr
             f"within {1e3 * was:.0f} mm before, {1e3 * now:.0f} mm after; "
             f"{found.moving:,} tie points that it saw elsewhere (things that move) are left out"
         )
-    return [*lines, *_camera_lines(cameras, free), *found.notes]
+    return [*lines, *boresight_lines(found.edges), *_camera_lines(cameras, free), *found.notes]
 
 
 def _camera_lines(cameras: CameraErrors | None, free: FreeCameras | None) -> list[str]:

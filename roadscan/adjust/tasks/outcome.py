@@ -30,7 +30,7 @@ SOLUTION: Final = "solution"
 """Name and unit in the manifest of the solution, which has no separate file."""
 TABLES: Final = (
     "tie_residuals", "control_residuals", "relative_accuracy", "absolute_accuracy", "accuracy_by_distance",
-    "picture_residuals", "picture_control", "depth_residuals",
+    "picture_residuals", "picture_control", "depth_residuals", "edge_boresights",
 )  # fmt: skip
 """Tables of the outcome; each is a product of the manifest with one unit."""
 PICTURES: Final = "adjustment_picture"

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.adjustment import Adjustment, CameraErrors, CommonErrors, ControlErrors, MountingErrors, adjust
+from roadscan.adjust.bundle.edge_boresight import edge_observations
 from roadscan.adjust.bundle.outcome import PictureOutcome, outcome_of
 from roadscan.adjust.bundle.self_check import FreeCameras, free_cameras
 from roadscan.adjust.bundle.solve import Approached, PictureEvidence, approached
@@ -304,6 +305,7 @@ def _adjusted(
     settings = _settings(config, mode)
     priors, cameras, approach = evidence.mounted.priors, list[CameraPrior](), None
     if evidence.pictures is not None and mode == "joint":
+        joined = Observations.joined([joined, edge_observations(evidence.pictures.edges)])
         approach = approached(evidence.pictures, (joined, first), evidence.priors, settings, priors)
         more = [] if approach.depths is None else [approach.depths.observations]
         joined = Observations.joined([joined, *more, approach.rows.observations])

@@ -82,11 +82,8 @@ def depth_tasks(
     picture, pixel = tied
     order = np.argsort(picture, kind="stable")
     starts = np.searchsorted(picture[order], np.arange(len(exposures) + 1))
-    chosen = _chosen(exposures, np.diff(starts) > 0, priors.depth_every_m)
-    lidars: dict[tuple[str, str], list[tuple[ReadingSource, DataFile]]] = {}
-    for source, files in sorted(plan.sources, key=lambda pair: (pair[0].run, pair[0].sensor, pair[0].key)):
-        if source.table == "returns" and source.trajectory is not None:
-            lidars.setdefault((source.run, source.sensor), []).extend((source, f) for f in files if f.group_spans)
+    chosen = chosen_pictures(exposures, np.diff(starts) > 0, priors.depth_every_m, _MOST_PICTURES)
+    lidars = lidars_of(plan)
     batch = exposures.epoch_gps_ns[chosen] // _BATCH_NS
     cuts = np.flatnonzero((np.diff(batch) != 0) | (np.diff(exposures.camera[chosen]) != 0)) + 1
     code, tasks = code_digest(f"{__name__}:write_returns"), []
@@ -117,17 +114,26 @@ def depth_tasks(
     return tasks
 
 
-def _chosen(exposures: Exposures, has_ties: npt.NDArray[np.bool_], every_m: float) -> Int64:
-    """Returns numbers of pictures with tie points that lie some way apart, by camera and time."""
+def lidars_of(plan: SurveyPlan) -> dict[tuple[str, str], list[tuple[ReadingSource, DataFile]]]:
+    """Returns the files of lidars by run and sensor."""
+    lidars: dict[tuple[str, str], list[tuple[ReadingSource, DataFile]]] = {}
+    for source, files in sorted(plan.sources, key=lambda pair: (pair[0].run, pair[0].sensor, pair[0].key)):
+        if source.table == "returns" and source.trajectory is not None:
+            lidars.setdefault((source.run, source.sensor), []).extend((source, f) for f in files if f.group_spans)
+    return lidars
+
+
+def chosen_pictures(exposures: Exposures, usable: npt.NDArray[np.bool_], every_m: float, most: int) -> Int64:
+    """Returns numbers of usable pictures that lie some way apart, by camera and time; `most` of them."""
     found = []
     for camera in range(len(exposures.cameras)):
-        rows = np.flatnonzero((exposures.camera == camera) & has_ties)
+        rows = np.flatnonzero((exposures.camera == camera) & usable)
         rows = rows[np.argsort(exposures.epoch_gps_ns[rows], kind="stable")]
         way = np.linalg.norm(np.diff(exposures.eye_world_m[rows], axis=0), axis=1)
         along = np.concatenate([np.zeros(min(rows.size, 1)), np.cumsum(way)])
         found.append(rows[np.unique(np.floor(along / every_m), return_index=True)[1]])
     chosen = np.concatenate([np.zeros(0, np.int64), *found])
-    return chosen[:: max(1, -(-chosen.size // _MOST_PICTURES))]
+    return chosen[:: max(1, -(-chosen.size // most))]
 
 
 def _spread(pixel: Float64) -> Float64:
@@ -139,14 +145,9 @@ def write_returns(task: DepthTask) -> OutputRecord:
     """Find the returns about the tie points of pictures and write them (runs on a worker)."""
     count = len(task.exposures)
     parts: list[list[Float64]] = [[] for _ in range(count)]
-    placer = Georeferencer(task.store, task.ground, [one.slice for one in task.files], recorded=True)
-    for file in task.files:
-        for group in file.groups:
-            rows = read_rows(task.store, file.source, file.path, [group]).combine_chunks()
-            for batch in rows.to_batches():
-                placed = placed_readings(batch, geometry_of(file.source), placer.placement(file.source))
-                for k in range(count):
-                    parts[k].append(_near(task, k, placed.points_m, placed.epoch_gps_ns))
+    for points_m, epochs_gps_ns in readings_about(task.store, task.ground, task.files):
+        for k in range(count):
+            parts[k].append(_near(task, k, points_m, epochs_gps_ns))
     points = [np.concatenate([np.zeros((0, 3)), *own]) for own in parts]
     names = np.repeat(task.exposures.file.astype(str), [len(own) for own in points])
     joined = np.concatenate(points)
@@ -156,6 +157,17 @@ def write_returns(task: DepthTask) -> OutputRecord:
     target = f"{schema.location}/{task.unit}.parquet"
     task.store.write_bytes(target, content, lasting=False)
     return OutputRecord(RETURNS, task.unit, task.key, target, len(content), bytes_digest(content))
+
+
+def readings_about(store: Store, ground: MapSettings, files: Sequence[NearFile]) -> Iterator[tuple[Float64, Int64]]:
+    """Yields returns (n, 3) of row groups in the map by the recorded poses, with their epochs (n,)."""
+    placer = Georeferencer(store, ground, [one.slice for one in files], recorded=True)
+    for file in files:
+        for group in file.groups:
+            rows = read_rows(store, file.source, file.path, [group]).combine_chunks()
+            for batch in rows.to_batches():
+                placed = placed_readings(batch, geometry_of(file.source), placer.placement(file.source))
+                yield placed.points_m, placed.epoch_gps_ns[placed.row]
 
 
 def _near(task: DepthTask, k: int, points_m: Float64, epochs_gps_ns: Int64) -> Float64:

@@ -48,6 +48,9 @@ class Pictures(Section):
         depths = _table(session, "depth_residuals")
         if depths is not None and depths.num_rows:
             yield _depths(depths)
+        edges = _table(session, "edge_boresights")
+        if edges is not None and edges.num_rows:
+            yield _edges(edges.to_pylist())
         yield _worst(rows)
         control = _table(session, "picture_control")
         if control is not None:
@@ -102,6 +105,23 @@ def _depths(rows: pa.Table) -> Table:
     return Table(
         ("run", "camera", "lidar", "depths that count", "median before (mm)", "median after (mm)"), listed,
         f"Tie points on surfaces of the lidar: {rows.num_rows - used.num_rows:,} more do not count", "depths",
+    )  # fmt: skip
+
+
+def _edges(rows: list[dict[str, Any]]) -> Table:
+    listed = [
+        (
+            one["sensor"], one["lidar"], f"{one['pictures']:,}", f"{one['edges']:,}",
+            one["why_not"] or ", ".join(
+                f"{axis} {one[f'{axis}_deg']:+.3f}° (σ {one[f'sigma_{axis}_deg']:.3f}°)"
+                for axis in ("roll", "pitch", "heading")
+            ),
+        )
+        for one in rows
+    ]  # fmt: skip
+    return Table(
+        ("camera", "lidar", "pictures", "range edges", "boresight that they show, or why not"), listed,
+        "Range edges of lidars at edges of pictures: turn from the stated boresight", "edge_boresights",
     )  # fmt: skip
 
 

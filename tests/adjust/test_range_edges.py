@@ -1,0 +1,136 @@
+"""Range edges against edges of pictures: the boresight comes back, with the σ that it has, or they say why not.
+
+Pictures and returns are cast here, ray by ray, onto boxes on a road; nothing of the library is used for that.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.spatial.transform import Rotation
+
+from roadscan.adjust.adjustment import adjust
+from roadscan.adjust.bundle.edge_boresight import EdgeBoresight, Sighted, boresight_of, edge_observations
+from roadscan.adjust.bundle.range_edges import EdgeScores, scores_of
+from roadscan.adjust.process import CameraPrior, GaussMarkov, MountingPrior, RunPrior
+from roadscan.adjust.solver_settings import AdjustmentSettings
+from roadscan.adjust.tasks.edge_scores import boresight_findings
+from roadscan.core.camera import Interior
+from roadscan.pictures.views import Lens
+
+Float64 = npt.NDArray[np.float64]
+
+AXES = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""Body (forward, right, down) from the camera (right, down, ahead)."""
+CAMERA_M, LIDAR_M = np.array([0.4, -0.1, 0.2]), np.array([0.0, 0.1, 0.0])
+SIZE, FOCAL = (440, 190), 290.0
+LENS = Lens.of(Interior(width_px=SIZE[0], height_px=SIZE[1], focal_px=(FOCAL, FOCAL), principal_px=(219.5, 80.0)))
+OFF_DEG = np.array([0.9, -1.1, 1.3])
+"""By which the camera is turned from how it is stated."""
+ROAD_M, WALL_M = 1.7, 45.0
+SHARED_RAD = np.radians(0.05)
+
+
+def _hits(eye: Float64, ray: Float64, boxes: Float64) -> tuple[Float64, npt.NDArray[np.int64]]:
+    """Distances (n,) along rays (n, 3) and what they meet: boxes (b, 2, 3), then road and wall."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = (boxes[None] - eye) / ray[:, None, None, :]
+        first, last = ends.min(axis=2).max(axis=2), ends.max(axis=2).min(axis=2)
+        near = np.where((first < last) & (first > 0.0), first, np.inf)
+        road = np.where(ray[:, 2] > 0.0, (ROAD_M - eye[2]) / ray[:, 2], np.inf)
+        wall = np.where(ray[:, 0] > 0.0, (WALL_M - eye[0]) / ray[:, 0], np.inf)
+    every = np.column_stack([near, road, wall])
+    return every.min(axis=1), every.argmin(axis=1)
+
+
+@functools.cache
+def _scene(seed: int) -> tuple[Float64, npt.NDArray[np.uint8]]:
+    """Returns of a lidar with 48 lasers (n, 3), body axes, and the picture of the camera that is turned."""
+    rng = np.random.default_rng(seed)
+    middle = np.column_stack([rng.uniform(7.0, 28.0, 14), rng.uniform(-9.0, 9.0, 14), np.zeros(14)])
+    half = rng.uniform([0.3, 0.2, 0.4], [1.6, 1.2, 1.2], (14, 3))
+    boxes = np.stack([middle - half, middle + half], axis=1)
+    boxes[:, 1, 2] = ROAD_M
+    down, right = np.meshgrid(np.radians(np.linspace(-6.0, 16.0, 48)), np.radians(np.arange(-42.0, 42.0, 0.2)))
+    ray = np.stack([np.cos(down) * np.cos(right), np.cos(down) * np.sin(right), np.sin(down)], axis=-1).reshape(-1, 3)
+    away, _ = _hits(LIDAR_M, ray, boxes)
+    returns = LIDAR_M + ray * (away + rng.normal(0.0, 0.01, away.size))[:, None]
+    turned = Rotation.from_rotvec(OFF_DEG, degrees=True).as_matrix() @ AXES
+    u, v = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+    seen = np.stack([(u - 219.5) / FOCAL, (v - 80.0) / FOCAL, np.ones(u.shape)], axis=-1).reshape(-1, 3) @ turned.T
+    _, what = _hits(CAMERA_M, seen, boxes)
+    grey = np.append(rng.uniform(30.0, 220.0, 14), [110.0, 160.0])[what] + rng.normal(0.0, 4.0, what.size)
+    return returns, np.clip(grey, 0, 255).astype(np.uint8).reshape(SIZE[::-1])
+
+
+def _scores(seeds: range, lever: Float64 = CAMERA_M, pictures_of: int = 0) -> list[EdgeScores]:
+    """Scores of scenes; `pictures_of` : pictures are those of scenes so many later."""
+    return [
+        scores_of(_scene(seed)[0], LIDAR_M, (lever, AXES), _scene(seed + pictures_of)[1], LENS) for seed in seeds
+    ]  # fmt: skip
+
+
+def _sighted(stated_deg: float = 0.5) -> Sighted:
+    return Sighted("camera", "lidar", 0, 1, 0, AXES, np.full(3, np.radians(stated_deg)))
+
+
+@pytest.fixture(scope="module")
+def found() -> EdgeBoresight:
+    """What eight scenes say."""
+    return boresight_of(_sighted(), _scores(range(8)), SHARED_RAD)
+
+
+@pytest.mark.parametrize("first", [100, 200])
+def test_the_boresight_comes_back_within_its_sigma(first: int) -> None:
+    own = boresight_of(_sighted(), _scores(range(first, first + 8)), SHARED_RAD)
+    left = np.degrees(own.turn) - OFF_DEG
+    assert not own.why_not
+    assert (np.abs(left) < 2.5 * np.degrees(own.sigma)).all()
+    assert (np.abs(left) < 0.15).all()
+    assert (np.degrees(own.sigma) < 0.15).all()
+
+
+def test_edges_of_another_scene_say_nothing() -> None:
+    own = boresight_of(_sighted(), _scores(range(8), pictures_of=50), SHARED_RAD)
+    assert own.why_not
+    assert edge_observations([own]).size == 0
+
+
+def test_few_pictures_say_nothing() -> None:
+    assert "too few" in boresight_of(_sighted(), _scores(range(3)), SHARED_RAD).why_not
+
+
+def test_a_lever_arm_that_is_off_turns_the_boresight_as_told(found: EdgeBoresight) -> None:
+    shift = np.array([0.0, 0.08, -0.06])
+    moved = boresight_of(_sighted(), _scores(range(8), CAMERA_M - shift), SHARED_RAD)
+    told = found.by_others[:, :3] @ shift
+    assert np.abs(np.degrees(told)).max() > 0.2
+    assert np.abs(np.degrees(moved.turn - found.turn - told)).max() < 0.1
+
+
+def test_the_adjustment_takes_what_edges_say(found: EdgeBoresight) -> None:
+    mountings = (
+        MountingPrior("camera", np.array([*[0.001] * 3, *np.radians([0.5] * 3), 0.0])),
+        MountingPrior("lidar", np.array([*[0.001] * 3, *np.radians([0.001] * 3), 0.0])),
+    )
+    cameras = (CameraPrior("camera", np.zeros(11)),)
+    runs = (RunPrior("run", 0, 1_000_000_000, (GaussMarkov(0.01, 60.0),) * 6),)
+    solved = adjust(edge_observations([found]), runs, AdjustmentSettings(), mountings, cameras)
+    left = np.degrees(solved.mountings.error[0, 3:6]) - OFF_DEG
+    assert (np.abs(left) < 0.15).all()
+    sigma = solved.mountings.sigma[0, 3:6]
+    assert sigma == pytest.approx(found.sigma, rel=0.1)
+
+
+@pytest.mark.witness("picture_edges")
+def test_a_boresight_that_edges_contradict_is_told(found: EdgeBoresight) -> None:
+    assert boresight_findings([found]) == []
+    exact = EdgeBoresight(_sighted(0.1), *[getattr(found, name) for name in (
+        "pictures", "edges", "turn", "covariance", "by_others", "why_not",
+    )])  # fmt: skip
+    (said,) = boresight_findings([exact])
+    assert said.subject == "camera"
+    assert f"heading {np.degrees(found.turn[2]):+.3f}°" in said.text

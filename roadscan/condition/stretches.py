@@ -5,11 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.compute.flags import runs_of
-
-Floats = npt.NDArray[np.float64]
 
 
 class Stretch(NamedTuple):
@@ -25,7 +23,7 @@ class Stretch(NamedTuple):
     """The greatest value, in the unit of the quantity."""
 
 
-def stretches_above(x_m: Floats, values: Floats, limit: float) -> list[Stretch]:
+def stretches_above(x_m: Float64, values: Float64, limit: float) -> list[Stretch]:
     """Return stretches where values (n,) at stations (n,) are above a limit, in order; NaN is not above it."""
     found = []
     for first, behind in runs_of(values > limit).tolist():

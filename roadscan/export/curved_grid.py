@@ -7,12 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.kernels.curved_grid import accumulate_curved
 from roadscan.compute.reference_line import ReferenceLine
 from roadscan.core.grid import QUANTUM_M
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

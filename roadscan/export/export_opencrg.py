@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan import __version__
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.reference_line import ReferenceLine
 from roadscan.core.errors import ConfigError, RunError
 from roadscan.core.grid import QUANTUM_M
@@ -27,9 +28,6 @@ from roadscan.georeference.sources import Georeferencer, RawSlice, ReadingSource
 from roadscan.navigation.tasks.trajectories import load_trajectory
 from roadscan.store.logs import DataFile
 from roadscan.store.store import Store
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _MOST_NODES: Final = 1 << 28  # larger grids are refused
 

@@ -9,6 +9,7 @@ from typing import Final, Self
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.simulate.cells import cells_of
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.earth import LocalMap
@@ -18,9 +19,6 @@ from roadscan.simulate.noise import stream
 from roadscan.simulate.scene import Mount, Scene
 from roadscan.simulate.surface import Surface
 from roadscan.simulate.things import Object, mover_bodies, moving_objects, objects_of
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 SLOT_NS: Final = 100_000_000
 """Length of the slots within which moving cars drive evenly, counted from a pass's first profile, however the sensors'

@@ -8,15 +8,13 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.simulate.kernels import ground as kernels
 from roadscan.simulate.kernels import things as body
 from roadscan.simulate.kernels.ground import CELL_M, SAMPLE_M, TILE_CELLS, TILE_M, Cells
 from roadscan.simulate.kernels.road import STATION
 from roadscan.simulate.scene import Road
 from roadscan.simulate.surface import Surface
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _CHUNK_SAMPLES: Final = 640
 """Stations that are examined at a time."""

@@ -9,6 +9,7 @@ import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.simulate import features, roughness
 from roadscan.simulate.kernels import road as kernels
 from roadscan.simulate.kernels.road import NODE_STEP_M, RoadArrays
@@ -16,9 +17,6 @@ from roadscan.simulate.noise import stream
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.scene.road import CrossSlope, Element, Kerb, Road
 from roadscan.simulate.texture import CELL_M, texture_field
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 RIDE_WAVELENGTH_M = 10.0
 """Wavelength below which waves do not move the vehicle, because its tyres and springs absorb them (m)."""

@@ -10,13 +10,10 @@ import functools
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
 
+from roadscan.compute.array_types import Float32, Float64
 from roadscan.simulate.noise import stream
-
-Float64 = npt.NDArray[np.float64]
-Float32 = npt.NDArray[np.float32]
 
 CELLS: Final = 1024
 """Cells along an edge of the field, a power of two."""

@@ -21,6 +21,7 @@ from typing import Any, BinaryIO, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Int32
 from roadscan.core.errors import StoreError
 from roadscan.core.gpstime import utc_from_gps_ns
 from roadscan.core.ids import TileId
@@ -176,8 +177,6 @@ def _written(
     writer.add(waiting)
     return []
 
-
-Int32 = npt.NDArray[np.int32]
 
 LEAF_POINTS: Final = 65_536
 """Nodes with at most this many points are not divided."""

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.crs import MapFrame, crs_from_text
 from roadscan.core.errors import ConfigError, RoadscanError
 from roadscan.run.code_reach import code_digest
@@ -276,8 +276,6 @@ def _longitude_latitude(frame: MapFrame, extent_m: Box | None) -> list[float] | 
     middle = np.array([[(extent_m[0] + extent_m[2]) / 2, (extent_m[1] + extent_m[3]) / 2]])
     return [round(v, 8) for v in to_longitude_latitude(frame)(middle)[0].tolist()]
 
-
-Float64 = npt.NDArray[np.float64]
 
 _AROUND_M: Final = 2000.0
 """Margin around the survey (m): people also look for places beside the road."""

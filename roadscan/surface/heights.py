@@ -7,11 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64
 from roadscan.core.errors import RoadscanError
 from roadscan.surface.lowest import LowestReadings
-
-Float64 = npt.NDArray[np.float64]
-Bool = npt.NDArray[np.bool_]
 
 HEIGHT_STEP_M = 1e-5
 """Heights are whole multiples of this (m), so that sums do not depend on their order."""

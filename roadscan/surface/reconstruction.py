@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
+from roadscan.compute.array_types import Bool, Float32, Float64
 from roadscan.core.grid import QUANTUM_M, Bounds, TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.strict import Strict
@@ -43,10 +44,6 @@ from roadscan.tiles.cells import TileCells
 if TYPE_CHECKING:
     from roadscan.surface.clough_tocher import CubicSurface
 
-
-Float64 = npt.NDArray[np.float64]
-Float32 = npt.NDArray[np.float32]
-Bool = npt.NDArray[np.bool_]
 
 SHOWN_M: Final = 1.15
 """Least margin of the neighbouring tiles that products read (m)."""

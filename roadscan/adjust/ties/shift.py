@@ -16,13 +16,13 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.kernels.correlation import Laid, correlate, lay_upon
 from roadscan.adjust.patches import Patch, level_from_map, map_from_axes
 from roadscan.adjust.pictures import BLUR_CELLS, Picture, pictures_of
 from roadscan.adjust.tie_settings import TieSettings
 from roadscan.adjust.ties.tie import SHIFT, End, Tie
+from roadscan.compute.array_types import Float64, Int64
 
 DISAGREE: Final = "relief and paint disagree"
 _DISAGREE_SIGMA: Final = 5.0  # Relief and paint contradict one another from this many σ on.
@@ -85,9 +85,6 @@ def _ties(first: Patch, second: Patch, shift: Shift, group: int) -> list[Tie]:
         )
     return out
 
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 UNLIKE: Final = "pictures are not alike"
 AT_EDGE: Final = "best shift at the edge of the search"

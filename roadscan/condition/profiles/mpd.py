@@ -11,12 +11,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.profiles.segments import Segments
 from roadscan.condition.profiles.texture import TextureSegment
-
-Floats = npt.NDArray[np.float64]
 
 
 class MeanProfileDepth(NamedTuple):
@@ -32,7 +30,7 @@ class MeanProfileDepth(NamedTuple):
     """Number of segments that begin in the stretch."""
 
 
-def segment_depth_mm(height_mm: Floats) -> float:
+def segment_depth_mm(height_mm: Float64) -> float:
     """Return the depth (mm) of a segment from its heights (n,): mean of both halves' peaks above the mean of all."""
     middle = height_mm.size // 2
     return float(0.5 * (height_mm[:middle].max() + height_mm[middle:].max()) - height_mm.mean())

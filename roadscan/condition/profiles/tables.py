@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.profiles.iri import LOCAL_M, half_car_ride, iri_of, mean_roughness_index, rolling_iri
 from roadscan.condition.profiles.mpd import mean_profile_depths
 from roadscan.condition.profiles.profile_faults import NOTABLE, PROFILE_STEPS, SoundHeights, sound_heights, too_high_by
@@ -23,7 +24,6 @@ from roadscan.core.witness import Finding
 if TYPE_CHECKING:
     import pandas as pd
 
-Floats = npt.NDArray[np.float64]
 
 FLATTEST_M_PER_KM = 0.1
 """Least IRI of a road: a lower one was measured in another unit, or is no road."""
@@ -230,14 +230,14 @@ def _sound_ride(x_m: npt.ArrayLike, height_m: npt.ArrayLike) -> tuple[Ride, list
     return on, heights
 
 
-def _rounding(x: Floats, sound: SoundHeights, parts: Segments, found: Floats) -> Floats:
+def _rounding(x: Float64, sound: SoundHeights, parts: Segments, found: Float64) -> Float64:
     """Return the part of the IRI of segments (m/km) that is due to rounding."""
     if sound.step_m < FINEST_STEP_M:
         return np.zeros_like(found)
     return too_high_by(found, iri_of(ride(x, sound.rounded_again()), parts).iri_m_per_km)
 
 
-def _left_out(x: Floats, sound: Sequence[SoundHeights], parts: Segments, k: int) -> list[str]:
+def _left_out(x: Float64, sound: Sequence[SoundHeights], parts: Segments, k: int) -> list[str]:
     """Return words for the samples of a segment that were left out."""
     inside = (x >= parts.from_m[k]) & (x <= parts.to_m[k])
     told = {"stuck": [one.stuck for one in sound], "spikes": [one.spike for one in sound]}
@@ -248,12 +248,12 @@ def _whose(names: Sequence[str]) -> list[str]:
     return [f"profile {name}" for name in names] if len(names) > 1 else [""]
 
 
-def _findings(x: Floats, sound: Sequence[SoundHeights], names: Sequence[str]) -> list[Finding]:
+def _findings(x: Float64, sound: Sequence[SoundHeights], names: Sequence[str]) -> list[Finding]:
     of_each = (one.findings(x, whose) for one, whose in zip(sound, _whose(names), strict=True))
     return [finding for own in of_each for finding in own]
 
 
-def _joined(on: Ride, parts: Segments, segment_m: float | None, found: Floats) -> list[str]:
+def _joined(on: Ride, parts: Segments, segment_m: float | None, found: Float64) -> list[str]:
     """Join the notes of all profiles, each word once."""
     of_all = on.notes(parts, segment_m)
     flat = np.atleast_1d((found < FLATTEST_M_PER_KM).any(axis=0))

@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
+from roadscan.compute.array_types import Float64
 from roadscan.compute.robust import scatter_about
 from roadscan.condition.roughness_regions.intensity import three_classes
 from roadscan.condition.roughness_regions.points import RoadPoints, pyramid, rotated_back
@@ -70,9 +71,6 @@ def severity(own: RoadPoints, around: RoadPoints) -> Severity:
     mean = float(np.sum(own.readings * above)) / readings
     sigma = float(np.sqrt(np.sum(own.readings * (above - mean) ** 2) / readings))
     return Severity(contrast, intensity, mean, sigma, scatter_about(rest, float(np.median(rest))))
-
-
-Float64 = npt.NDArray[np.float64]
 
 
 NO_CONTRAST: Final = "no_contrast"

@@ -21,6 +21,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import shapely
 
+from roadscan.compute.array_types import Float64
 from roadscan.compute.robust import scatter_about
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.roads import Drive, StatedLine, find_roads
@@ -323,8 +324,6 @@ def load_roads(store: Store, manifest: Manifest, context: ProductContext) -> Roa
     )  # fmt: skip
     return Roads(lines, lanes)
 
-
-Float64 = npt.NDArray[np.float64]
 
 _LONGEST_STEP_NS: Final = 11_000_000
 """At a longer interval the fourth differences of poses contain the vehicle's movement."""

@@ -12,6 +12,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.index import condition_indices
 from roadscan.condition.kernels.ruts import wire_places
 from roadscan.condition.lane_data import LaneData
@@ -195,8 +196,6 @@ def _title(group: Group) -> str:
     named = f"{group.line.name} ({group.lane.road})" if group.line.name else group.lane.road
     return f"{named}, lane {group.lane.name}, {group.lane.direction}"
 
-
-Float64 = npt.NDArray[np.float64]
 
 _COLOURS: Final = ("#1f5fa8", "#c8501e", "#3b8a3e", "#7a4fa3")
 _DOTS_PER_INCH: Final = 110  # Resolution of the pictures.

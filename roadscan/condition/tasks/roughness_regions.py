@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.roughness_regions.intensity import normalised_intensity
 from roadscan.condition.roughness_regions.points import RoadPoints
@@ -226,8 +227,6 @@ def _draw(task: RegionTask, piece: Piece, found: Sequence[SectionRegions]) -> Ou
         task.store.publish(path, target)
     return OutputRecord(REGION_PICTURES, piece.unit, piece.key, target, size, digest)
 
-
-Float64 = npt.NDArray[np.float64]
 
 _FINER: Final = 4.0
 """Survey cells are joined to blocks of at most this fraction of a raster cell: closer points add no information."""

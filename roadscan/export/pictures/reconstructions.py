@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import ConfigError
 from roadscan.core.frames import ENU_FROM_NED, quaternion_from_rotation
 from roadscan.core.gpstime import utc_from_gps_ns
@@ -33,8 +33,6 @@ from roadscan.georeference.picture_axes import map_from_ned
 from roadscan.measuring.poses import PicturePoses
 from roadscan.pictures.views import Lens
 from roadscan.run.session import Session
-
-Float64 = npt.NDArray[np.float64]
 
 OFFSET_FILE: Final = "offset.json"
 """Where the local frame lies."""

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.export.pictures.chosen import LocalFrame
 from roadscan.measuring.measure import posed_pictures
 from roadscan.measuring.poses import PicturePoses
@@ -21,9 +21,6 @@ from roadscan.pictures.ties.work import ALL
 from roadscan.pictures.views import Views
 from roadscan.run.session import Session
 from roadscan.store.manifest import recorded_table
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _RESIDUALS: Final = "picture_residuals"  # Name of the table of judged measurements, and its manifest's.
 

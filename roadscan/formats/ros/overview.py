@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, ClassVar, Final, Protocol, runtime_checkable
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.counted import counted
 from roadscan.core.frames import BODY_FROM_AXES, rotation_from_quaternion, rph_from_rotation
 from roadscan.core.gpstime import NS_PER_S
@@ -83,8 +83,6 @@ def _frame(bag: Bag, topic: Topic) -> str:
         return str(posed or getattr(getattr(content, "header", None), "frame_id", ""))
     return ""
 
-
-Float64 = npt.NDArray[np.float64]
 
 _TYPES: Final = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")  # the second is that of ROS 1 before tf2
 _NAME: Final = "tf_static"

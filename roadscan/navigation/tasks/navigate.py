@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import ConfigError, DamagedError, RoadscanError, RunError
 from roadscan.core.survey import Survey
 from roadscan.ingest.ingest import ingested_of, survey_records
@@ -169,8 +170,6 @@ def records_of(session: Session) -> tuple[LogRecord, ...]:
     """
     return tuple(records_with_trajectories(session.survey, session.store, ingested_of(session)))
 
-
-Float64 = npt.NDArray[np.float64]
 
 SPLINE: Final = "spline"
 """Format of the records of these trajectories."""

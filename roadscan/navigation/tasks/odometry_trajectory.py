@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.crs import LOCAL_WORLD
 from roadscan.core.errors import NavigationError
 from roadscan.core.extras import is_installed
@@ -215,10 +216,6 @@ def _mounted(survey: Survey, log: LogRecord, kind: str) -> Sensor:
     return sensor_of(survey.rig, log, kind).mounted_as(log.attributes.get("mounting", {}))
 
 
-Int64 = npt.NDArray[np.int64]
-Float64 = npt.NDArray[np.float64]
-Flags = npt.NDArray[np.bool_]
-
 LIDAR_ODOMETRY: Final = Witness(
     "lidar_odometry",
     input="lidar",
@@ -241,7 +238,7 @@ def findings(
 ) -> Iterator[Finding]:
     """Yield a finding for each kind of contradiction, with the number of its times and the worst of them."""
 
-    def told(bad: Flags, at: Int64, size: Float64, words: str, left_out: int = 0) -> Iterator[Finding]:
+    def told(bad: Bool, at: Int64, size: Float64, words: str, left_out: int = 0) -> Iterator[Finding]:
         if bad.any():
             worst = int(np.argmax(np.where(bad, size, -np.inf)))
             text = words.format(count=int(bad.sum()), of=bad.size, size=size[worst], at=iso_from_gps_ns(int(at[worst])))

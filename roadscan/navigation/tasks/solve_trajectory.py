@@ -15,6 +15,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.errors import NavigationError
 from roadscan.core.frames import rotation_from_quaternion
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
@@ -201,9 +202,6 @@ def _summary(solution: Solution, gnss: GnssSolutions) -> dict[str, Any]:
         figures["outliers"] = int((found.weight < 1).sum())
     return figures
 
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 FAR_SIGMAS: Final = 6.0
 """A position this many σ from the trajectory disagrees with it."""

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Int64
 from roadscan.core.ids import LanePass, TileId
 from roadscan.core.survey import CellColumns
 from roadscan.footprints.footprints import FootprintRanges, footprints_of
@@ -42,8 +43,6 @@ _SHARES = (8, 4, 2, 1)
 
 _MOST_READ = 1.15
 """… unless tasks would read more than this many times the row groups: a lidar sees far beyond a stretch."""
-
-Int64 = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from roadscan.condition.profiles.ride_number import ride_number_of, ride_number_
 from roadscan.condition.profiles.segments import Segments, segments_of
 from roadscan.condition.profiles.spectrum import road_spectrum
 from roadscan.condition.profiles.straightedge import LENGTHS_M, straightedge_mm
-from roadscan.condition.stretches import stretches_above
+from roadscan.condition.profiles.tables import stretches_above
 from roadscan.core.errors import ProfileError
 
 

@@ -55,13 +55,14 @@ CARRIERS: Final = (
     "roadscan.core.strict",
     "roadscan.core.survey:Survey",
     "roadscan.core.survey:SurveyConfig",
+    "roadscan.georeference.plan.plan:poses_plan_of",
     "roadscan.store.logs",
     "roadscan.store.manifest",
     "roadscan.store.records",
     "roadscan.store.store",
 )
 """Modules left out of the digest: they transport data and change no result. Settings are covered by their values, files
-by their digests."""
+by their digests, a plan by the keys of its sources."""
 
 ARRAY_TYPES: Final = "roadscan.compute.array_types"
 """Module whose definitions count as if each module that imports them had written them: short names for types of arrays.

@@ -188,6 +188,14 @@ def test_the_tiles_reach_what_shapes_them_and_no_settings_of_other_stages() -> N
     ]
 
 
+def test_the_adjustment_reaches_no_code_that_planned_its_sources() -> None:
+    """Logs and trajectories count by the keys of the sources that come of them."""
+    modules = {p.partition(":")[0] for p in reached_code(["roadscan.adjust.tasks.adjustment:adjust_survey"])}
+    assert {"roadscan.adjust.estimation", "roadscan.adjust.control.control", "roadscan.georeference.place"} <= modules
+    rooms = ("ingest.planned_logs", "ingest.inspect", "navigation.inertial", "navigation.odometry", "simulate")
+    assert not [m for m in modules if m.startswith(tuple(f"roadscan.{room}" for room in rooms))]
+
+
 def test_outlines_are_kept_for_the_next_process(package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """They are used as long as they are whole, of this very source, and where nobody else may write."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))

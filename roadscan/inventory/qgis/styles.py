@@ -149,7 +149,6 @@ def _symbol(symbol: str, options: Mapping[str, str], opacity: float) -> Element:
     return held
 
 
-_NOT_NULL: Final = 1  # Bit of QGIS's constraint flags: not null.
 _EXPRESSION: Final = 4  # Bit of QGIS's constraint flags: expression.
 _HARD: Final = 1
 """Constraint strength: QGIS refuses values that violate it; 2 would warn."""

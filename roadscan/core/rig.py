@@ -1,4 +1,4 @@
-"""The rig: sensors and how they are mounted on the vehicle (``RIG.toml``)."""
+"""The rig: sensors, how wide their beams are, and how they are mounted on the vehicle (``RIG.toml``)."""
 
 from __future__ import annotations
 

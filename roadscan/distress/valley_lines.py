@@ -23,8 +23,7 @@ from roadscan.compute.array_types import Bool, Float64, Int32, Int64
 from roadscan.core.extras import cv2
 from roadscan.distress.kernels.crack_response import add_bend, deepen, fill_holes, line_sums
 from roadscan.distress.settings import CrackDetection
-from roadscan.surface.heights import HEIGHT_STEP_M
-from roadscan.surface.lowest import CROWD_CELLS
+from roadscan.surface.heights import CROWD_CELLS, HEIGHT_STEP_M
 
 DIRECTIONS = 24  # Directions of lines, 7.5° apart.
 LINE_HALF = 10  # Cells of a line to either side of its middle.

@@ -13,8 +13,8 @@ from roadscan.core.rig import Mounting, Mountings
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.core.settings.segmentation import RangeFilter, RoadSegmentation
 from roadscan.georeference.classes import KEPT, NOT_ROAD, OVERLAPPING
+from roadscan.georeference.kernels.carriageway import keep_road
 from roadscan.georeference.kernels.readings import NO_RETURN
-from roadscan.georeference.kernels.road_ranges import keep_road
 from roadscan.georeference.range_filter import kept_in_turns
 from roadscan.georeference.segmentation import segmented
 from roadscan.georeference.turns import turn_limits

@@ -48,7 +48,7 @@ from roadscan.surface.kernels.line_medians import (
     window_sums,
 )
 from roadscan.surface.kernels.supports import SUPPORTS, CrackCells, Shapes, heights_by_support, least_risk
-from roadscan.surface.smoothing_settings import SurfaceSmoothing
+from roadscan.surface.settings import SurfaceSmoothing
 
 _ABSENT = np.inf
 _HALF = CELLS // 2  # Cells of a line to either side of its middle.

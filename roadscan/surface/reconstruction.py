@@ -30,12 +30,11 @@ from roadscan.core.grid import QUANTUM_M, Bounds, TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.strict import Strict
 from roadscan.georeference.cloud import TilePoints
+from roadscan.surface.heights import LowestReadings
 from roadscan.surface.holes import RIM, Holes, cells_across
-from roadscan.surface.lowest import LowestReadings
-from roadscan.surface.settings import SlopeKind, SurfaceConfig
+from roadscan.surface.settings import SlopeKind, SurfaceConfig, SurfaceSmoothing
 from roadscan.surface.sites import sites
 from roadscan.surface.smoothing import halo_cells, smooth_surface
-from roadscan.surface.smoothing_settings import SurfaceSmoothing
 from roadscan.surface.tile import EMPTY, FILLED, INTERPOLATED, MEASURED, SurfaceTile
 from roadscan.surface.triangulation import triangulate
 from roadscan.surface.window import GridWindow

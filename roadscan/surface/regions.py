@@ -25,7 +25,7 @@ import shapely
 from roadscan.compute.array_types import Bool, Float64
 from roadscan.surface.coarse import CoarseModel
 from roadscan.surface.kernels.coarse import PATCH_SUMS, sum_patches
-from roadscan.surface.region_settings import RegionSettings
+from roadscan.surface.settings import RegionSettings
 
 FOUND: Final = "found"
 STATED: Final = "stated"

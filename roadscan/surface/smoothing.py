@@ -58,10 +58,9 @@ from roadscan.compute.array_types import Bool, Float32, Float64, UInt8
 from roadscan.core.errors import RoadscanError
 from roadscan.surface.detail_median import REACH as MEDIAN_REACH
 from roadscan.surface.detail_median import detail_median
-from roadscan.surface.kernels.directional_filters import choose_filters
 from roadscan.surface.kernels.smoothing import REACH as STEP_REACH
-from roadscan.surface.kernels.smoothing import descend
-from roadscan.surface.smoothing_settings import SurfaceSmoothing
+from roadscan.surface.kernels.smoothing import choose_filters, descend
+from roadscan.surface.settings import SurfaceSmoothing
 
 FILTER_BOUND = 38.0 / 21.0
 """Upper bound of the spectral norm of SᵀS for one filter a cell, any cells missing."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import StateSpace, lsim, welch
 
-from roadscan.condition.kernels.straightedge import roll_beam, roll_wheel
+from roadscan.condition.kernels.steps import roll_beam, roll_wheel
 from roadscan.condition.profiles.ride_number import ride_number_of, ride_number_ride
 from roadscan.condition.profiles.segments import Segments, segments_of
 from roadscan.condition.profiles.spectrum import road_spectrum

@@ -42,7 +42,7 @@ THROUGH_ITS_CALLER = {
     "surface.kernels.delaunay.turn": "tests/kernels/test_natural_neighbour.py",
     "surface.kernels.clough_tocher.control_points": "tests/surface/test_detailed.py",
     "surface.kernels.clough_tocher.cross_slopes": "tests/surface/test_detailed.py",
-    "surface.kernels.patch_grid.evaluate": "tests/surface/test_detailed.py",
+    "surface.kernels.clough_tocher.evaluate": "tests/surface/test_detailed.py",
     "surface.kernels.spline_gradients.load": "tests/surface/test_detailed.py",
     "surface.kernels.spline_gradients.spline_gradients": "tests/surface/test_detailed.py",
     "surface.kernels.vertex_gradients.vertex_gradients": "tests/surface/test_detailed.py",

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.array_types import Float64
-from roadscan.condition.kernels.straightedge import roll_beam, roll_wheel
+from roadscan.condition.kernels.steps import roll_beam, roll_wheel
 from roadscan.condition.profiles.profiles import heights_of, stations_of
 from roadscan.condition.profiles.quarter_car import COARSEST_M
 from roadscan.core.errors import ProfileError

@@ -1,4 +1,4 @@
-"""Steps of a longitudinal profile (differences of lines fitted on both sides of a place); wheels and beams that roll."""
+"""Steps of a longitudinal profile (differences of lines fitted on both sides of a place); rolling wheels and beams."""
 
 from __future__ import annotations
 

@@ -19,9 +19,9 @@ from benchmarks.timing import Figure
 from roadscan.distress.crack_network import Crack, join_cracks
 from roadscan.distress.cracks import crack_pieces
 from roadscan.distress.settings import CrackDetection, CrackJoining
-from roadscan.surface.lowest import LowestReadings
+from roadscan.surface.heights import LowestReadings
+from roadscan.surface.settings import SurfaceSmoothing
 from roadscan.surface.smoothing import smooth_surface
-from roadscan.surface.smoothing_settings import SurfaceSmoothing
 
 CELL_M = 0.005
 SLOTS_M = ((0.003, 0.005), (0.005, 0.003), (0.005, 0.008), (0.010, 0.005), (0.010, 0.010), (0.015, 0.010))

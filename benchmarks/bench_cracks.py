@@ -25,10 +25,9 @@ from roadscan.distress.settings import CrackDetection, CrackJoining, PotholeDete
 from roadscan.distress.valley_lines import LINE_HALF, flank_cells
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
-from roadscan.surface.heights import HeightWindow
-from roadscan.surface.lowest import LowestReadings
+from roadscan.surface.heights import HeightWindow, LowestReadings
+from roadscan.surface.settings import SurfaceSmoothing
 from roadscan.surface.smoothing import smooth_surface
-from roadscan.surface.smoothing_settings import SurfaceSmoothing
 
 SEEDS = (1, 2, 3)
 READING_M, SIGMA_M = 0.001, 0.0003

@@ -18,8 +18,8 @@ from scipy.spatial import Delaunay
 from benchmarks.timing import Figure, in_turns, thread_seconds
 from roadscan.core.grid import Bounds
 from roadscan.surface.clough_tocher import cubic_surface
-from roadscan.surface.detailed import DetailedSettings, detailed_surface
 from roadscan.surface.normals import slopes_at
+from roadscan.surface.reconstruction import DetailedSettings, detailed_surface
 from roadscan.surface.sites import sites
 from roadscan.surface.triangulation import triangulate
 from roadscan.surface.window import GridWindow

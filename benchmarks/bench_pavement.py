@@ -22,11 +22,10 @@ from roadscan.core.ids import TileId
 from roadscan.store.codecs.cog import Band
 from roadscan.store.codecs.gdal import raster_settings
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.decimate import decimate
 from roadscan.tiles.product import ProductContext, Tile, TileSummary
 from roadscan.tiles.products.hillshade import HillshadeOptions, shade
 from roadscan.tiles.products.kilometre import Kilometre, KilometreOptions
-from roadscan.tiles.products.model_las import ModelLas, ModelLasFine
+from roadscan.tiles.products.model_las import ModelLas, ModelLasFine, decimate
 from roadscan.tiles.products.pavement import IntensityOptions, PavementIntensity, PavementShaded, ShadedOptions
 from roadscan.tiles.products.raster import CellBox, SparseRaster, paste_tile
 from roadscan.tiles.pyramid import Level

@@ -21,8 +21,8 @@ from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.store.store import Store
 from roadscan.surface.reconstruction import surface_of
+from roadscan.surface.stage import plan_surface_work
 from roadscan.surface.tasks.surface_plan import SurfacePlan
-from roadscan.surface.tasks.surface_work import plan_surface_work
 from roadscan.surface.tasks.surfaces import compute_surfaces, source_of
 from roadscan.survey.run import run_stages
 

@@ -14,9 +14,9 @@ from benchmarks.timing import Figure
 from roadscan.core.imu import ImuGrade
 from roadscan.core.settings.smoothing import SmootherConfig
 from roadscan.navigation.inertial.adaptive import solve_adaptively
-from roadscan.navigation.inertial.outcome import figures_of
 from roadscan.navigation.inertial.readings import Solution
 from roadscan.navigation.inertial.smoother import solve
+from roadscan.navigation.tasks.solve_trajectory import figures_of
 from tests.navigation.inertial_drives import (
     DRIVE_CONFIG,
     INSTANT,

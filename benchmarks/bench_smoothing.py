@@ -12,8 +12,8 @@ from scipy.ndimage import median_filter
 from scipy.sparse.linalg import cg, spsolve
 
 from benchmarks.timing import Figure, thread_seconds
+from roadscan.surface.settings import SurfaceSmoothing
 from roadscan.surface.smoothing import Smoothing, smooth_surface, steps
-from roadscan.surface.smoothing_settings import SurfaceSmoothing
 from tests.surface.patches import (
     CLASSES_M,
     PROFILER_1,

@@ -23,8 +23,7 @@ from roadscan.run.session import Session
 from roadscan.site.material import Material
 from roadscan.site.site import publish
 from roadscan.store.salvage import read_lost
-from roadscan.survey.arrival.template import FleetTemplate, write_survey
-from roadscan.survey.arrival.watched import Record, Watched
+from roadscan.survey.arrival.watched import FleetTemplate, Record, Watched, write_survey
 from roadscan.survey.status import verify_store
 
 T = TypeVar("T")

@@ -18,8 +18,7 @@ from prefect.utilities.hashing import hash_objects
 
 from roadscan.core.errors import ConfigError, RoadscanError
 from roadscan.flows.expected import failed
-from roadscan.survey.arrival.template import FleetTemplate
-from roadscan.survey.arrival.watched import Record, Watched
+from roadscan.survey.arrival.watched import FleetTemplate, Record, Watched
 
 What = Literal["arrived", "refused", "changed", "published", "failed"]
 

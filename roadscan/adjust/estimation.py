@@ -12,17 +12,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.observations import COMPONENTS, KINDS
 from roadscan.adjust.solver_settings import AdjustmentSettings
 from roadscan.adjust.sparse_normal import NormalEquations, Rows, SelectedInverse
 from roadscan.adjust.unknowns import Unknowns
 from roadscan.adjust.weights import Groups, LeftOut, Pace, left_out
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
+from roadscan.compute.array_types import Bool, Float64, Int64
 
 SURVEY: Final = len(KINDS)
 """Kind of the rows that observe a control point at its surveyed place."""

@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.control.control_test import quantile
 from roadscan.adjust.observations import COMPONENTS
 from roadscan.adjust.unknowns import Unknowns
+from roadscan.compute.array_types import Float64
 from roadscan.core.gpstime import NS_PER_S
-
-Float64 = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,9 @@ from roadscan.adjust.adjustment import ControlErrors
 from roadscan.adjust.control.control import Sighting
 from roadscan.adjust.control.control_test import quantile
 from roadscan.adjust.patches import level_from_map
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.errors import ConfigError
 from roadscan.poses.trajectory import Corrections
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 _THIN: Final = 1e-3
 """Points whose second extent is below this share of their first are collinear."""

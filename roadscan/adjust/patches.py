@@ -12,13 +12,8 @@ import numpy.typing as npt
 
 from roadscan.adjust.kernels.patch_cells import Cells, Frame, cell_numbers, fill_cells, local_axes
 from roadscan.adjust.places import Place
+from roadscan.compute.array_types import Float64, Int32, Int64, UInt16
 from roadscan.core.errors import NavigationError
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Int32 = npt.NDArray[np.int32]
-UInt16 = npt.NDArray[np.uint16]
-
 
 Shift: TypeAlias = tuple[float, float, float]
 """Shift of a whole traverse: north, east, down (m, local level)."""

@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.canvas import empty_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Float64 = npt.NDArray[np.float64]
 
 _BEFORE: Final = "#d1495b"
 _AFTER: Final = "#1f5fa8"

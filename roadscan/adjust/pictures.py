@@ -8,12 +8,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.kernels.patch_cells import Splat, splat
 from roadscan.adjust.patches import Patch
-
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 BLUR_CELLS: Final = 1.2
 """σ (cells) of the Gaussian that smooths images: else interpolation between cells would damp their noise and draw

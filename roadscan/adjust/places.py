@@ -19,12 +19,9 @@ import numpy.typing as npt
 
 from roadscan.adjust.kernels.visits import Bins, Limits, Meetings, Samples, Spread, Visits, feet, meetings, visits
 from roadscan.adjust.tie_settings import PlaceSettings
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.errors import NavigationError
 from roadscan.core.gpstime import NS_PER_S
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 _STEP_M: Final = 2.0
 """Greatest spacing of samples (m); the chord of a bend of 10 m leaves it by 5 cm."""

@@ -6,14 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.observations import Observations
+from roadscan.compute.array_types import Float64
 from roadscan.poses.trajectory import Corrections
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-
 
 _SAME_SIGMA: Final = 0.05
 """σ that differ by no more than this share are equal: evidence changes them a little with each new run."""

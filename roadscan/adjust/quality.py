@@ -9,10 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.adjustment import ControlErrors
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.errors import ConfigError
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 NSSDA_VERTICAL: Final = 1.9600
 """Ratio of the 95 % quantile of normal errors to the RMSE (FGDC-STD-007.3-1998, 3.2.1 and appendix 3-A)."""

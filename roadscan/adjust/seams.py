@@ -6,15 +6,13 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.patches import PassReadings, Patch, map_from_level, patch_of
 from roadscan.adjust.places import Place
 from roadscan.adjust.tie_settings import TieSettings
+from roadscan.compute.array_types import Float64
 from roadscan.poses.mounting_change import MountingChange, Seat
 from roadscan.poses.trajectory import Corrections
-
-Float64 = npt.NDArray[np.float64]
 
 _SECTION: Final = 0.2
 """Share of the patch, about its middle, whose rows are averaged to a cross-section."""

@@ -16,9 +16,7 @@ import scipy
 
 from roadscan.adjust.kernels.normal_equations import add_observations
 from roadscan.adjust.kernels.selected_inverse import entries, path_lengths, selected_inverse, solved_units, variances
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from roadscan.compute.array_types import Float64, Int64
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.poses.level import LevelPoses
-
-Float64 = npt.NDArray[np.float64]
 
 _SHARE = 2.0
 """Per cent of the readings that lie beyond either side."""

@@ -12,12 +12,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.calibrate.robust import length_limit
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from roadscan.compute.array_types import Float64, Int64
 
 HUBER_LIMIT: Final = 1.5
 """Huber's limit (σ): at least 95 % efficiency where all is normal."""

@@ -40,6 +40,7 @@ from roadscan.calibrate.unknowns import (
     Unknowns,
     priors_of,
 )
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import ConfigError
 from roadscan.core.rig import Mounting
 from roadscan.core.settings.calibration import CalibrationSettings
@@ -57,7 +58,6 @@ __all__ = [
     "priors_of",
 ]
 
-Float64 = npt.NDArray[np.float64]
 
 Finder = Callable[[Estimate], Sequence[Evidence]]
 """Searches for evidence with improved mountings, by which correspondences change."""

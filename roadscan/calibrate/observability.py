@@ -16,8 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.calibrate.unknowns import MOUNTING, Unknowns
-
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 AXES: Final = (
     "forward lever arm",

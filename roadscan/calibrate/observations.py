@@ -24,10 +24,8 @@ from roadscan.calibrate.evidence import Directions, Evidence, Known, Orientation
 from roadscan.calibrate.kernels.ties import tie_residuals, tie_rows
 from roadscan.calibrate.orientations import OrientationObservations
 from roadscan.calibrate.unknowns import BODY, MOUNTING, Geometry, Unknowns
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.errors import NavigationError
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _CHUNK: Final = 65_536
 """Ties linearised at once: 26 derivatives a row then fit the cache."""

@@ -13,15 +13,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.calibrate.evidence import AttitudeInfluence, Orientation
 from roadscan.calibrate.rotations import left_jacobian, logarithm
 from roadscan.calibrate.unknowns import MOUNTING, Geometry, Unknowns
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import NavigationError
 from roadscan.core.gpstime import NS_PER_S
-
-Float64 = npt.NDArray[np.float64]
 
 _TESTED: Final = 1e-4
 """Directions in which the other evidence has less than this share of the orientation's information cannot contradict

@@ -15,20 +15,16 @@ from dataclasses import dataclass, replace
 from typing import Final, Self
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from roadscan.calibrate.evidence import Known, Seen, Ties
 from roadscan.calibrate.surfels import Surfels
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.compute.robust import scatter_about
 from roadscan.core.errors import ConfigError
 from roadscan.core.extras import small_gicp
 from roadscan.core.rig import Mounting
 from roadscan.core.strict import Strict
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 KIND: Final = "reference"
 

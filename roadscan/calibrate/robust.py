@@ -16,12 +16,10 @@ from functools import cache
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.calibrate.observations import Observations
+from roadscan.compute.array_types import Float64
 from roadscan.core.settings.calibration import CalibrationSettings
-
-Float64 = npt.NDArray[np.float64]
 
 _ENOUGH: Final = 30
 """Least number of observations from whose median their spread is estimated."""

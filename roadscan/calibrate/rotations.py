@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.frames import quaternion_from_rotation
-
-Float64 = npt.NDArray[np.float64]
 
 
 def cross_matrix(vector: Float64) -> Float64:

@@ -28,6 +28,7 @@ from scipy.sparse import csr_matrix, diags
 
 from roadscan.calibrate.evidence import AttitudeInfluence, Orientation
 from roadscan.calibrate.rotations import cross_matrix, exponential, logarithm
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.robust import SIGMA_OF_MAD
 from roadscan.core.crs import LOCAL_WORLD
 from roadscan.core.errors import NavigationError
@@ -37,9 +38,6 @@ from roadscan.core.rig import Mounting
 from roadscan.navigation.inertial.earth import EARTH_RATE_ECEF_RAD_PER_S, gravity_ecef
 from roadscan.navigation.inertial.readings import ImuReadings
 from roadscan.poses.trajectory import Trajectory
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 KIND: Final = "stop and go"
 

@@ -7,15 +7,13 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _FLAT: Final = 0.2
 """A cell may contain a plane if its thickness is below this share of its second extent."""

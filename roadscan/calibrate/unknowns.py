@@ -16,11 +16,10 @@ import numpy.typing as npt
 
 from roadscan.calibrate.evidence import Traverse
 from roadscan.calibrate.rotations import exponential, left_jacobian
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.rig import Mounting, Sensor
 from roadscan.core.settings.calibration import CalibrationSettings
-
-Float64 = npt.NDArray[np.float64]
 
 MOUNTING: Final = 7
 """Unknowns of a sensor: lever arm (3), small rotation about body axes (3), range offset."""

@@ -12,15 +12,12 @@ from functools import cached_property
 from typing import Final, Self
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.kernels.curved_grid import thin_path
 from roadscan.compute.ways import smoothed_knots, way_along
 from roadscan.core.errors import NavigationError
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 KNOT_M: Final = 0.25
 """Spacing of the knots along a path is at least this, so that a standing vehicle's noise adds no distance."""

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 SIGMA_OF_MAD: Final = 1.4826
 """Ratio of a normal distribution's standard deviation to its median absolute deviation: 1 / Φ⁻¹(3/4) (Hampel 1974)."""

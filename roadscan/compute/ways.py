@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 
 def way_along(places_m: Float64) -> Float64:

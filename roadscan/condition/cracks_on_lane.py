@@ -6,11 +6,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.road_line import Lane, RoadLine
-
-Float64 = npt.NDArray[np.float64]
 
 PIECE_M: Final = 0.05
 """Cracks are divided into pieces of at most this length (m)."""

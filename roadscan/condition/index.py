@@ -16,11 +16,10 @@ from typing import ClassVar, Final, Literal, NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.lane_data import LaneData
 from roadscan.core.plugins import found_kinds
 from roadscan.core.witness import Finding
-
-Float64 = npt.NDArray[np.float64]
 
 How: TypeAlias = Literal["mean", "max"]
 

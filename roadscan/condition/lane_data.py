@@ -9,13 +9,12 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.cracks_on_lane import CrackOnLane
 from roadscan.condition.on_lane.lines import LaneLines
 from roadscan.condition.on_lane.squares import TextureSquares
 from roadscan.condition.road_edges.on_lane import EdgesOnLane
 from roadscan.condition.settings import SectionConfig
-
-Float64 = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

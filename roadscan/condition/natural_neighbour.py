@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.kernels.delaunay_mesh import mesh_of, triangulate
 from roadscan.condition.kernels.natural_neighbour import (
     STEP_M,
@@ -14,8 +15,6 @@ from roadscan.condition.kernels.natural_neighbour import (
     natural_neighbour_raster,
     slopes_of_points,
 )
-
-Float64 = npt.NDArray[np.float64]
 
 WIDEST_M: Final = 100.0
 """Greatest extent of the points: positions are integers whose products have to fit 128 bits."""

@@ -13,9 +13,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.kernels.road_frame import place
-
-Float64 = npt.NDArray[np.float64]
 
 NODE_M: Final = 1.0
 """Distance between the nodes of a line, and between those of a lane's middle (m)."""

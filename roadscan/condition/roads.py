@@ -10,13 +10,11 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from roadscan.compute.array_types import Bool, Float64
 from roadscan.compute.kernels.curved_grid import thin_path
 from roadscan.compute.ways import smoothed_knots, way_along
 from roadscan.condition.road_line import NODE_M, Lane, RoadLine
 from roadscan.condition.settings import ConditionConfig
-
-Float64 = npt.NDArray[np.float64]
-Bool = npt.NDArray[np.bool_]
 
 LEAST_M: Final = 20.0
 """Shorter pieces of a drive are neither a road nor a lane."""

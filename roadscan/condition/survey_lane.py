@@ -8,15 +8,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.kernels.sampling import CellTable, sample
 from roadscan.condition.on_lane.lines import LINE_REACH_M, LaneLines, lane_lines
 from roadscan.condition.on_lane.squares import TextureSquares, texture_squares
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.settings import SectionConfig
-
-Float64 = npt.NDArray[np.float64]
 
 SIDES: Final = {"left": -1.0, "right": 1.0}
 """Wheel paths, with the side of the lane's middle on which they lie, in the direction of travel."""

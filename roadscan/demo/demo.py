@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.compute.robust import scatter_about
 from roadscan.condition.tasks.against_truth import compared_values
 from roadscan.core.extras import need
@@ -22,9 +22,6 @@ from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
 from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE
-
-Float64 = npt.NDArray[np.float64]
-
 
 _SHOWN: Final = ("mri_m_per_km", "rut_depth_mean_left_mm", "rut_depth_mean_right_mm", "cross_slope_mean_percent")
 

@@ -34,12 +34,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.distress.kernels.quantiles_along import quantiles_along
-from roadscan.surface.heights import HeightWindow
-from roadscan.surface.lowest import LowestReadings
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from roadscan.surface.heights import HeightWindow, LowestReadings
 
 NARROW_CELLS: Final = 2.5  # Width (cells) up to which the depth comes from lowest readings alone.
 WIDE_CELLS: Final = 3.5  # Width (cells) from which it comes from robust heights alone.

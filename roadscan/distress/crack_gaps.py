@@ -12,11 +12,9 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.distress.cracks import CrackPiece
-
-Float64 = npt.NDArray[np.float64]
 
 _ASIDE: Final = math.tan(math.radians(30.0))  # Tangent of the most that an end may point past the other.
 _ASIDE_CELLS: Final = 1.5  # Distance (cells) that is allowed aside on top of that angle.

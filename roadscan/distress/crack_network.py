@@ -12,13 +12,12 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.distress.crack_gaps import bridges_of, outwards
 from roadscan.distress.crack_parts import Network, components, grouped, parts_of, united
 from roadscan.distress.cracks import CrackPiece
 from roadscan.distress.settings import CrackJoining
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 CrackType = Literal["longitudinal", "transverse", "diagonal", "alligator", "unknown"]
 
 _KINDS: Final[tuple[CrackType, ...]] = ("longitudinal", "transverse", "diagonal", "alligator", "unknown")

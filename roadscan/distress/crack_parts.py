@@ -18,11 +18,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
+from roadscan.compute.array_types import Bool, Float64, Int64
 
 NET: Final = 3
 """Type of a net; types 0, 1, 2 run along, across and diagonal to the lane."""

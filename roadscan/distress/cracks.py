@@ -22,8 +22,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.compute.ways import way_along
 from roadscan.distress import valleys
 from roadscan.distress.crack_depths import ValleyCells, blended, bottom_depths
@@ -34,9 +34,6 @@ from roadscan.distress.skeleton_graph import PRUNINGS, SkeletonGraph, pruned, tr
 from roadscan.distress.valley_lines import DIRECTIONS, flank_cells
 from roadscan.distress.valleys import Valleys, bridge_cells, find_valleys
 from roadscan.surface.heights import HeightWindow
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _SMOOTHINGS = 3  # Passes that move each vertex of a line towards the middle of its neighbours.
 _LOWER_FLANK = 0.5

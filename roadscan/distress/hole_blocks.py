@@ -24,13 +24,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.extras import cv2
 from roadscan.distress.settings import PotholeDetection
 from roadscan.surface.heights import HEIGHT_STEP_M, HeightWindow
 from roadscan.surface.kernels.ground import depths, grounds, slopes
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _RAYS = 16  # Rays from each block, evenly spread over the circle.
 _BEYOND_M = 0.25

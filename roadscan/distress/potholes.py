@@ -20,18 +20,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.extras import cv2
 from roadscan.distress.hole_blocks import Blocks, block_cells, blocks_around
 from roadscan.distress.kernels.crack_response import fill_holes
 from roadscan.distress.settings import PotholeDetection, PotholeJoining
 from roadscan.surface.heights import HEIGHT_STEP_M, HeightWindow
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 _THIN_M = 0.03
 """Parts narrower than this (m) are no pothole, such as cracks that meet it."""

@@ -18,18 +18,12 @@ import functools
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64, Int32, Int64
 from roadscan.core.extras import cv2
 from roadscan.distress.kernels.crack_response import add_bend, deepen, fill_holes, line_sums
 from roadscan.distress.settings import CrackDetection
-from roadscan.surface.heights import HEIGHT_STEP_M
-from roadscan.surface.lowest import CROWD_CELLS
-
-Float64 = npt.NDArray[np.float64]
-Int32 = npt.NDArray[np.int32]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
+from roadscan.surface.heights import CROWD_CELLS, HEIGHT_STEP_M
 
 DIRECTIONS = 24  # Directions of lines, 7.5° apart.
 LINE_HALF = 10  # Cells of a line to either side of its middle.

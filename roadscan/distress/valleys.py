@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.extras import cv2
-from roadscan.distress.kernels.thinning import thin
+from roadscan.distress.kernels.crack_response import thin
 from roadscan.distress.settings import CrackDetection
 from roadscan.distress.valley_lines import (
     DIRECTIONS,

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.extras import needed
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-Float64 = npt.NDArray[np.float64]
 
 _MOST_CELLS: Final = 400_000_000  # larger grids are refused
 _RASTERS: Final = {"height_m": "height_robust_m", "intensity": "intensity_mean", "count": "count"}

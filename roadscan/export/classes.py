@@ -13,6 +13,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from roadscan.compute.array_types import Int64, UInt8
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.ids import LanePass, TileId
 from roadscan.core.scan_geometry import ScanGeometry
@@ -29,9 +30,6 @@ from roadscan.store.store import Store
 from roadscan.tiles.tasks.tile_points import near_lines
 
 TABLE: Final = "reading_classes"
-
-Int64 = npt.NDArray[np.int64]
-UInt8 = npt.NDArray[np.uint8]
 
 
 def write_classes(

@@ -12,6 +12,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan import __version__
+from roadscan.compute.array_types import Int64
 from roadscan.core.errors import ConfigError, RunError
 from roadscan.core.gpstime import NS_PER_S, utc_from_gps_ns
 from roadscan.core.scan_geometry import ScanGeometry
@@ -25,8 +26,6 @@ from roadscan.navigation.tasks.trajectories import load_trajectory
 from roadscan.poses.travel import Travel
 from roadscan.store.logs import DataFile
 from roadscan.store.store import Store
-
-Int64 = npt.NDArray[np.int64]
 
 _MM_PER_M: Final = 1e3  # millimetres of a metre
 _PIECE_BYTES: Final = 48 << 20

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-Float64 = npt.NDArray[np.float64]
-Bool = npt.NDArray[np.bool_]
+from roadscan.compute.array_types import Bool, Float64
+
 Box = tuple[float, float, float, float]
 
 

@@ -15,10 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.crs import LOCAL_WORLD, MapFrame
 from roadscan.core.errors import NavigationError
-
-Float64 = npt.NDArray[np.float64]
 
 BOX_M = 200.0  # Edge of a box: within 300 m of its centre an expansion errs by less than 2 µm.
 STEP_M = 100.0

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.crs import MapFrame
 from roadscan.poses.trajectory import world_from_ned
-
-Float64 = npt.NDArray[np.float64]
 
 
 def camera_from_map(

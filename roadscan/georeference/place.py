@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float64, Int32, Int64, UInt8
 from roadscan.compute.kernel_options import read_only
 from roadscan.core.crs import (
     Geoid,
@@ -36,11 +37,6 @@ from roadscan.georeference.kernels.readings import FATES, Georeference, Limits, 
 from roadscan.georeference.kernels.timed_points import georeference_mirror, georeference_returns
 from roadscan.georeference.road_profiles import RoadFinder, RoadProfiles
 from roadscan.poses.trajectory import Trajectory
-
-Float64 = npt.NDArray[np.float64]
-Int32 = npt.NDArray[np.int32]
-Int64 = npt.NDArray[np.int64]
-UInt8 = npt.NDArray[np.uint8]
 
 EIGHT_TO_SIXTEEN_BITS: Final = 257
 """Factor from 8-bit to 16-bit intensities: 255 becomes 65,535."""

@@ -24,12 +24,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64
 from roadscan.core.settings.segmentation import RangeFilter
-
-Float64 = npt.NDArray[np.float64]
-Bool = npt.NDArray[np.bool_]
 
 
 def crossing_limits(path_m: Float64, heading_rad: Float64, settings: RangeFilter) -> Float64:

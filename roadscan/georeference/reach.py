@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64, UInt16
 from roadscan.compute.kernel_options import read_only
 from roadscan.core.grid import QUANTA_PER_M
 from roadscan.core.rig import Mounting, Mountings
@@ -20,10 +21,6 @@ from roadscan.georeference.kernels.reach import SpannedProfiles, reach_of_profil
 from roadscan.georeference.kernels.readings import Georeference, Limits
 from roadscan.poses.movement import NO_CORRECTION, Allowance
 from roadscan.poses.trajectory import Trajectory
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-UInt16 = npt.NDArray[np.uint16]
 
 PIECE_M: Final = 1.0
 """Profiles are cut into pieces of about this width at their farthest reading."""

@@ -8,20 +8,17 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Int64, UInt8, UInt16
 from roadscan.core.rig import Mounting, Mountings
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.core.settings.segmentation import RangeFilter, RoadSegmentation
 from roadscan.georeference.classes import KEPT, NOT_ROAD, OVERLAPPING
+from roadscan.georeference.kernels.carriageway import keep_road
 from roadscan.georeference.kernels.readings import NO_RETURN
-from roadscan.georeference.kernels.road_ranges import keep_road
 from roadscan.georeference.range_filter import kept_in_turns
 from roadscan.georeference.segmentation import segmented
 from roadscan.georeference.turns import turn_limits
 from roadscan.poses.trajectory import Trajectory
-
-Int64 = npt.NDArray[np.int64]
-UInt8 = npt.NDArray[np.uint8]
-UInt16 = npt.NDArray[np.uint16]
 
 _FIRST: Final = min(NOT_ROAD)
 

@@ -50,12 +50,11 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import UInt8
 from roadscan.compute.kernel_options import read_only
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.core.settings.segmentation import SegmentationConfig
 from roadscan.georeference.kernels.segmentation import segment_profiles
-
-UInt8 = npt.NDArray[np.uint8]
 
 
 def segmented(

@@ -5,16 +5,13 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.kernel_options import read_only
 from roadscan.core.crs import MapFrame
 from roadscan.core.rig import Mountings
-from roadscan.georeference.kernels.tick_places import between_ticks
+from roadscan.georeference.kernels.timed_points import between_ticks
 from roadscan.poses.trajectory import Trajectory
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _TICK_NS: Final = 20_000_000
 """Positions are computed at multiples of this and are linear between: at 10 m/s² the error is 0.5 mm."""

@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.settings.segmentation import RangeFilter
 from roadscan.georeference.range_filter import limits_of_turns
 from roadscan.poses.trajectory import Poses, Trajectory
@@ -26,9 +27,6 @@ WINDOW_NS: Final = 200 * TICK_NS
 
 _WINDOW: Final = WINDOW_NS // TICK_NS
 _NANO: Final = 1e-9  # Steps are summed as whole nanometres and nanoradians.
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 
 def turn_limits(

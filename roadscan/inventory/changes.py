@@ -19,6 +19,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import shapely
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.inventory.identity import outlines, points_along
 from roadscan.inventory.state import live_commits
@@ -30,9 +31,6 @@ from roadscan.store.inventory_schema import GEOMETRY, asset_table
 _MISSED_BY_A_PASS: Final = 0.1  # Greatest share of the assets in sight that a pass misses.
 _FALSE_SHARE: Final = 0.01  # Expected share of false changes among those reported.
 _MOST_SIGMAS: Final = 38.0  # Largest significance (σ): smaller probabilities underflow.
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 
 class Change(NamedTuple):
@@ -147,8 +145,8 @@ class _Pair(NamedTuple):
     then_alone: pa.Table
     appeared: pa.Table
     unseen: pa.Table
-    sigma_horizontal_m: Floats
-    sigma_height_m: Floats
+    sigma_horizontal_m: Float64
+    sigma_height_m: Float64
 
 
 def _pair(kind: str, one: pa.Table, other: pa.Table, known: pa.ChunkedArray) -> _Pair:
@@ -169,7 +167,7 @@ def _pair(kind: str, one: pa.Table, other: pa.Table, known: pa.ChunkedArray) -> 
     return _Pair(kind, *both, alone, now.filter(pc.invert(is_known)), unseen, horizontal, height)
 
 
-def _numbers(column: pa.ChunkedArray, missing: float = math.nan) -> Floats:
+def _numbers(column: pa.ChunkedArray, missing: float = math.nan) -> Float64:
     return np.asarray(pc.fill_null(column.cast(pa.float64()), missing).to_numpy(zero_copy_only=False), dtype=float)
 
 
@@ -188,10 +186,10 @@ class _Compared:
     """Comparisons of one sort: the probability of each difference by chance, and a function that makes its change."""
 
     def __init__(self) -> None:
-        self.chances: list[Floats] = []
+        self.chances: list[Float64] = []
         self.makers: list[Callable[[int], Change]] = []
 
-    def add(self, chances: Floats, maker: Callable[[int], Change]) -> None:
+    def add(self, chances: Float64, maker: Callable[[int], Change]) -> None:
         """Add comparisons; `maker` gets the position of one."""
         self.chances.append(chances)
         self.makers.append(maker)
@@ -240,7 +238,7 @@ def _compare_values(pair: _Pair, compared: _Compared) -> None:
         compared.add(chance, _value_changes(pair, column.name, np.flatnonzero(both), is_text=sigma is None))
 
 
-def _value_changes(pair: _Pair, name: str, places: Ints, *, is_text: bool) -> Callable[[int], Change]:
+def _value_changes(pair: _Pair, name: str, places: Int64, *, is_text: bool) -> Callable[[int], Change]:
     def change(at: int) -> Change:
         row = int(places[at])
         one, shape = pair.now["asset_id"][row].as_py(), pair.now[GEOMETRY][row].as_py()
@@ -250,7 +248,7 @@ def _value_changes(pair: _Pair, name: str, places: Ints, *, is_text: bool) -> Ca
     return change
 
 
-def _away(old: npt.NDArray[Any], new: npt.NDArray[Any]) -> Floats:
+def _away(old: npt.NDArray[Any], new: npt.NDArray[Any]) -> Float64:
     """Returns horizontal distances in the map's unit; for lines and areas the median along them."""
     if not len(old) or shapely.get_type_id(old[0]) == 0:
         return np.asarray(shapely.distance(old, new), dtype=float)

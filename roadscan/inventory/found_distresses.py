@@ -17,6 +17,7 @@ import shapely
 
 from roadscan.assets.object_table import object_names
 from roadscan.assets.tasks.along_roads import along_roads
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.condition.tasks.lines import survey_roads
 from roadscan.core.grid import QUANTA_PER_M
 from roadscan.core.ids import TileId
@@ -37,9 +38,6 @@ from roadscan.tiles.tasks.wanted_products import product_context
 _PIXEL_M: Final = 0.04
 """Approximate edge of the pixels from which heights are taken (m)."""
 _HELD_TILES: Final = 256  # Overviews of tiles kept in memory.
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 
 class FoundKind(NamedTuple):
@@ -100,7 +98,7 @@ class Ground:
         """Returns the GPS time (ns) at which the survey's first pass began."""
         return min((one.start_gps_ns for one in plan_of(self._session).passes), default=0)
 
-    def summaries(self, places_m: Floats) -> list[TileSummary | None]:
+    def summaries(self, places_m: Float64) -> list[TileSummary | None]:
         """Returns the figures of the tile of each place (n, 2); None where there are no readings."""
         found: list[TileSummary | None] = [None] * len(places_m)
         for tile, own, _ in self._by_tile(places_m):
@@ -110,7 +108,7 @@ class Ground:
                 found[at] = one
         return found
 
-    def heights_m(self, places_m: Floats) -> Floats:
+    def heights_m(self, places_m: Float64) -> Float64:
         """Returns heights (n,) at places (n, 2) on the map: of the pixel there, else of the nearest one in the tile.
 
         Where a tile has no readings, the height of the nearest other place that has one is used.
@@ -131,7 +129,7 @@ class Ground:
             out[~known] = out[known][cKDTree(places_m[known]).query(places_m[~known])[1]]
         return np.asarray(np.nan_to_num(out), dtype=np.float64)
 
-    def is_surveyed(self, places_m: Floats) -> npt.NDArray[np.bool_]:
+    def is_surveyed(self, places_m: Float64) -> npt.NDArray[np.bool_]:
         """Returns a mask (n,) of the places (n, 2) with readings."""
         out = np.zeros(len(places_m), dtype=bool)
         for tile, own, pixel in self._by_tile(places_m):
@@ -148,7 +146,7 @@ class Ground:
         raised = np.column_stack([places, self.heights_m(places)])
         return np.asarray(shapely.set_coordinates(shapely.force_3d(shapes_m), raised))
 
-    def _by_tile(self, places_m: Floats) -> Iterator[tuple[TileId, Ints, Ints]]:
+    def _by_tile(self, places_m: Float64) -> Iterator[tuple[TileId, Int64, Int64]]:
         """Yields each tile with the indices of its places and their pixels (n, 2), column and row."""
         grid = self.context.grid
         quanta = np.floor(places_m * QUANTA_PER_M).astype(np.int64)
@@ -161,7 +159,7 @@ class Ground:
             yield TileId(column, row), own, inside // (grid.cell_quanta * self._factor)
 
 
-def _in_level(level: Level, pixel: Ints) -> tuple[Ints, npt.NDArray[np.bool_]]:
+def _in_level(level: Level, pixel: Int64) -> tuple[Int64, npt.NDArray[np.bool_]]:
     """Returns positions of pixels (n, 2) in a level, and a mask of those with readings."""
     keys = level.row.astype(np.int64) << 32 | level.column
     wanted = pixel[:, 1] << 32 | pixel[:, 0]
@@ -185,7 +183,7 @@ class SeenByCells:
     def _ground(self) -> Ground:
         return Ground(self._session)
 
-    def expected_passes(self, kind: str, places_m: Floats) -> Ints:
+    def expected_passes(self, kind: str, places_m: Float64) -> Int64:
         """Returns the passes (n,) that should have seen assets of a kind; of distresses 1 where there are readings."""
         if not asset_schema(kind).found_in:
             return self._assets.expected_passes(kind, places_m)

@@ -15,6 +15,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import shapely
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.inventory.settings import Matching
 from roadscan.store.asset_schema import asset_schema
 from roadscan.store.digest import bytes_digest
@@ -34,16 +35,13 @@ _SIZE_OF_MOVED: Final = 0.25
 """Greatest mean relative difference of sizes between a moved asset and itself."""
 _DIGITS: Final = "0123456789abcdefghjkmnpqrstvwxyz"  # Crockford's alphabet: no i, l, o, u
 
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-
 
 class Pairs(NamedTuple):
     """Candidates: rows of known and found assets, and the cost of matching them (0 to 1)."""
 
-    known: Ints
-    found: Ints
-    cost: Floats
+    known: Int64
+    found: Int64
+    cost: Float64
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +55,7 @@ class Known:
     """Mask (n,) of the assets that the newest survey should have seen at their places."""
 
 
-def matched(kind: str, known: Known, found: pa.Table, settings: Matching, unit_m: float = 1.0) -> Ints:
+def matched(kind: str, known: Known, found: pa.Table, settings: Matching, unit_m: float = 1.0) -> Int64:
     """Returns for each found object the row of the known asset that it matches, -1 for none.
 
     Parameters
@@ -93,7 +91,12 @@ def matched(kind: str, known: Known, found: pa.Table, settings: Matching, unit_m
 
 
 def _find_moved(
-    known: Known, there: npt.NDArray[Any], sizes: tuple[Floats, Floats], settings: Matching, unit_m: float, result: Ints
+    known: Known,
+    there: npt.NDArray[Any],
+    sizes: tuple[Float64, Float64],
+    settings: Matching,
+    unit_m: float,
+    result: Int64,
 ) -> None:
     """Match an asset with the nearest object of about its size if it should have been seen at its place but was not."""
     free_known, free_found = _free(result, known.rows.num_rows)
@@ -109,7 +112,7 @@ def _find_moved(
     _assign(Pairs(pairs.known[keep], pairs.found[keep], (pairs.cost + difference)[keep]), result)
 
 
-def _free(result: Ints, known: int) -> tuple[Ints, Ints]:
+def _free(result: Int64, known: int) -> tuple[Int64, Int64]:
     taken = np.zeros(known, dtype=bool)
     taken[result[result >= 0]] = True
     return np.flatnonzero(~taken), np.flatnonzero(result < 0)
@@ -120,7 +123,7 @@ def _shapes(table: pa.Table, unit_m: float) -> npt.NDArray[Any]:
     return shapes if unit_m == 1.0 else np.asarray(shapely.transform(shapes, lambda xy: xy * unit_m))
 
 
-def _sigmas(table: pa.Table) -> Floats:
+def _sigmas(table: pa.Table) -> Float64:
     """Returns σ (n, 2), horizontal and in height; 0 where it is not known."""
     columns = [
         np.asarray(table[name].to_numpy(zero_copy_only=False), dtype=float)
@@ -129,7 +132,7 @@ def _sigmas(table: pa.Table) -> Floats:
     return np.asarray(np.nan_to_num(np.column_stack(columns)), dtype=float)
 
 
-def _near_points(a: npt.NDArray[Any], b: npt.NDArray[Any], sigma_a: Floats, sigma_b: Floats, least_m: float) -> Pairs:
+def _near_points(a: npt.NDArray[Any], b: npt.NDArray[Any], sigma_a: Float64, sigma_b: Float64, least_m: float) -> Pairs:
     widest = max(least_m, _SIGMAS * float(np.hypot(sigma_a.max(), sigma_b.max())))
     left, right = shapely.STRtree(b).query(a, predicate="dwithin", distance=widest)
     gate = np.maximum(least_m, _SIGMAS * np.hypot(sigma_a[left], sigma_b[right]))
@@ -140,7 +143,7 @@ def _near_points(a: npt.NDArray[Any], b: npt.NDArray[Any], sigma_a: Floats, sigm
 
 
 def _overlapping(
-    a: npt.NDArray[Any], b: npt.NDArray[Any], sigma_a: Floats, sigma_b: Floats, limits_m: tuple[float, float]
+    a: npt.NDArray[Any], b: npt.NDArray[Any], sigma_a: Float64, sigma_b: Float64, limits_m: tuple[float, float]
 ) -> Pairs:
     """Returns lines and outlines that overlap, within four σ clipped to `limits_m`."""
     lines_a, lines_b = outlines(a), outlines(b)
@@ -178,20 +181,20 @@ def points_along(lines: npt.NDArray[Any]) -> npt.NDArray[Any]:
     return np.asarray(shapely.points(*(np.interp(at, length, column) for column in places.T)))
 
 
-def _along(a: npt.NDArray[Any], b: npt.NDArray[Any], within_m: Floats) -> tuple[Floats, Floats]:
+def _along(a: npt.NDArray[Any], b: npt.NDArray[Any], within_m: Float64) -> tuple[Float64, Float64]:
     """Returns the share of points along `a` within a distance of `b`, and their closeness: 1 on it, 0 that far away."""
     ratio = shapely.distance(points_along(a), b[:, np.newaxis]) / within_m[:, np.newaxis]
     return (ratio <= 1.0).sum(axis=1) / _SAMPLES, np.maximum(1.0 - ratio, 0.0).sum(axis=1) / _SAMPLES
 
 
-def _sizes(kind: str, table: pa.Table) -> Floats:
+def _sizes(kind: str, table: pa.Table) -> Float64:
     """Returns the sizes (n, m) of the assets in all their columns of unit m; NaN where not known."""
     names = [c.name for c in asset_schema(kind).own if c.unit == "m"]
     columns = [np.asarray(table[name].to_numpy(zero_copy_only=False), dtype=float) for name in names]
     return np.column_stack(columns) if columns else np.empty((table.num_rows, 0))
 
 
-def _size_difference(known: Floats, found: Floats, pairs: Pairs) -> Floats:
+def _size_difference(known: Float64, found: Float64, pairs: Pairs) -> Float64:
     """Returns the mean relative difference of the lengths that both have, 0 to 1; 0 where they share none."""
     a, b = known[pairs.known], found[pairs.found]
     relative = np.minimum(np.abs(a - b) / np.maximum(np.maximum(np.abs(a), np.abs(b)), 0.1), 1.0)
@@ -199,7 +202,7 @@ def _size_difference(known: Floats, found: Floats, pairs: Pairs) -> Floats:
     return np.asarray(np.nansum(relative, axis=1) / np.maximum(count, 1), dtype=float)
 
 
-def _assign(pairs: Pairs, result: Ints) -> None:
+def _assign(pairs: Pairs, result: Int64) -> None:
     """Choose pairs, one to one: as many as possible, with the least sum of costs."""
     import scipy.sparse
 
@@ -217,7 +220,7 @@ def _assign(pairs: Pairs, result: Ints) -> None:
             _assign_together(Pairs(pairs.known[rows], pairs.found[rows], pairs.cost[rows]), result)
 
 
-def _assign_together(pairs: Pairs, result: Ints) -> None:
+def _assign_together(pairs: Pairs, result: Int64) -> None:
     from scipy.optimize import linear_sum_assignment
 
     known, a = np.unique(pairs.known, return_inverse=True)

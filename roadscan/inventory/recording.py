@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import datetime as dt
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,6 @@ import shapely
 from roadscan.core.errors import SchemaError
 from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, leap_seconds_at_gps, utc_from_gps_ns
 from roadscan.inventory.identity import Known, matched, new_ids
-from roadscan.inventory.parents import Placed, parents_of
 from roadscan.inventory.settings import Matching
 from roadscan.inventory.state import Assets, State, live_commits, state_at
 from roadscan.inventory.values import iso_column
@@ -231,3 +230,45 @@ def _unseen(kind: str, ids: npt.NDArray[Any], expected: npt.NDArray[np.int64]) -
         }
     )
     return _wide(kind, rows, 0)
+
+
+_REACH_M: Final = 1.0
+"""Greatest horizontal distance (m) of a point or line to its parent."""
+
+
+class Placed(NamedTuple):
+    """Assets of a kind with their places, in metres of the map."""
+
+    ids: npt.NDArray[Any]
+    shapes: npt.NDArray[Any]
+
+    def without(self, ids: Sequence[str]) -> Placed:
+        """Returns the same without some of them."""
+        keep = ~np.isin(self.ids, ids)
+        return Placed(self.ids[keep], self.shapes[keep])
+
+
+def parents_of(kind: str, placed: Mapping[str, Placed]) -> list[str | None]:
+    """Returns the id of the parent of each asset of a kind, None where none is within 1 m of it.
+
+    The kind that the schema names first wins, then the nearest asset, then the lower id.
+    with the lower id.
+    """
+    children = placed[kind]
+    found: list[str | None] = [None] * len(children.ids)
+    if not len(children.ids):
+        return found
+    points = shapely.force_2d(children.shapes)
+    for name in asset_schema(kind).parents:
+        parents = placed.get(name)
+        open_rows = np.array([at for at, one in enumerate(found) if one is None], dtype=np.int64)
+        if parents is None or not len(parents.ids) or not open_rows.size:
+            continue
+        there = shapely.force_2d(parents.shapes)
+        left, right = shapely.STRtree(there).query(points[open_rows], predicate="dwithin", distance=_REACH_M)
+        distance = shapely.distance(points[open_rows][left], there[right])
+        order = np.lexsort((parents.ids[right], distance, left))
+        first = np.flatnonzero(np.diff(left[order], prepend=-1))
+        for at in order[first]:
+            found[int(open_rows[left[at]])] = str(parents.ids[right[at]])
+    return found

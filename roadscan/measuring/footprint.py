@@ -9,13 +9,12 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
+from roadscan.compute.array_types import Float64
 from roadscan.measuring.ground import Ground
 from roadscan.measuring.measure import ground_hits
 from roadscan.measuring.poses import PicturePoses
 from roadscan.pictures.lens import rays_of
 from roadscan.pictures.views import HEIGHT, WIDTH, Lens
-
-Float64 = npt.NDArray[np.float64]
 
 _A_SIDE: Final = 8
 """Rays along each side of a picture."""

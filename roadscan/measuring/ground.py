@@ -11,6 +11,7 @@ from typing import Final, NamedTuple, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.compute.robust import scatter_about
 from roadscan.core.grid import Bounds, TileGrid
 from roadscan.core.ids import TileId
@@ -21,8 +22,6 @@ from roadscan.tiles.tasks.cell_files import read_cells, read_overview
 from roadscan.tiles.tasks.tile_figures import summary_of
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE
 
-Float64 = npt.NDArray[np.float64]
-Bool = npt.NDArray[np.bool_]
 T = TypeVar("T")
 
 _COARSE_M: Final = 0.21

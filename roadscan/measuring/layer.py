@@ -15,6 +15,7 @@ import pyarrow as pa
 import shapely
 
 from roadscan.assets.files.layers import Layer, write_geopackage
+from roadscan.compute.array_types import Float64
 from roadscan.core.frames import quaternion_from_rotation
 from roadscan.core.gpstime import utc_from_gps_ns
 from roadscan.measuring.footprint import footprint
@@ -29,8 +30,6 @@ from roadscan.store.store import Store
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.geo_table import read_geo_table, write_geo_table
 from roadscan.tiles.tasks.tile_files import publish_file
-
-Float64 = npt.NDArray[np.float64]
 
 PRODUCT: Final = "pictures"
 """Name in the manifest, and of the table."""

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.core.errors import RoadscanError
 from roadscan.core.gpstime import NS_PER_S
@@ -17,8 +16,6 @@ from roadscan.navigation.tasks.taken_pictures import TakenPictures
 from roadscan.pictures.frames.chosen import camera_pictures
 from roadscan.pictures.placed import plan_pictures
 from roadscan.pictures.views import PictureRule
-
-Int64 = npt.NDArray[np.int64]
 
 _ANYWHERE: Final = PictureRule((), 30.0, -90.0, 1)
 """Pictures of all cameras; its reach selects none here."""

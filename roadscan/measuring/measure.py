@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.grid import Bounds
 from roadscan.georeference.plan.plan import SurveyPlan, pictures_plan_of
@@ -26,8 +26,6 @@ from roadscan.pictures.lens import derivatives, eye_shifts_m, ray_slopes, rays_o
 from roadscan.pictures.placed import Pictures, plan_pictures
 from roadscan.pictures.views import HEIGHT, WIDTH, PictureRule
 from roadscan.run.session import Session, found_once
-
-Float64 = npt.NDArray[np.float64]
 
 REACH_M: Final = 60.0
 """Default of the farthest distance at which a ray is followed (m)."""

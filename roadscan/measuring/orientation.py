@@ -8,12 +8,10 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.calibrate.resection import SENSOR_FROM_OPENCV
+from roadscan.compute.array_types import Float64
 from roadscan.core.frames import rph_from_rotation
-
-Float64 = npt.NDArray[np.float64]
 
 _IMAGE_FROM_CAMERA: Final = np.diag([1.0, -1.0, -1.0])
 """Image axes of photogrammetry (right, up, backwards) from OpenCV's (right, down, ahead); its own inverse."""

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.calibrate.resection import SENSOR_FROM_OPENCV
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.ids import of_run
@@ -27,9 +27,6 @@ from roadscan.pictures.lens import PARAMETERS
 from roadscan.pictures.placed import Pictures
 from roadscan.poses.trajectory import world_from_ned
 from roadscan.store.small_tables import read_small
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _WORDS: Final = {0: "position", 3: "roll, pitch, heading"}
 """Words for the components of a pose, by the first of each."""

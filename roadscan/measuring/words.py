@@ -8,13 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.crs import MapFrame, crs_from_text
 from roadscan.core.errors import ConfigError
 from roadscan.measuring.measure import Measured, MeasuredPlace, length_of
-
-Float64 = npt.NDArray[np.float64]
 
 _DEGREE_DECIMALS, _METRE_DECIMALS = 9, 4
 """Decimals of degrees (0.1 mm) and of metres in GeoJSON."""

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.canvas import empty_figure, save_whole
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.navigation.picture import OTHER_COLOUR, QUALITY_COLOURS
@@ -18,7 +19,6 @@ from roadscan.navigation.picture import OTHER_COLOUR, QUALITY_COLOURS
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Float64 = npt.NDArray[np.float64]
 
 _MOST_POINTS: Final = 20_000
 """Most points of a panel; of more, every n-th is drawn."""

@@ -23,21 +23,17 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 from scipy.ndimage import binary_closing, median_filter
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.compute.flags import runs_of
 from roadscan.core.errors import NavigationError
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.core.settings.smoothing import SplineConfig
 from roadscan.navigation.inertial.motion import ned_from_world
 from roadscan.poses.trajectory import Trajectory
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 SIDE_S: Final = 0.5
 """Poses over this long beside a step or a gap determine the motion there."""
@@ -83,7 +79,7 @@ class Smoothed:
 
     trajectory: Trajectory
     changes: list[Mended]
-    touched: Flags
+    touched: Bool
     """(n,) poses of the result that changed or are new."""
 
 
@@ -233,7 +229,7 @@ def _begin_of(
 
 
 def _without_step(
-    trajectory: Trajectory, step: tuple[int, int, slice], config: SplineConfig, changes: list[Mended], touched: Flags
+    trajectory: Trajectory, step: tuple[int, int, slice], config: SplineConfig, changes: list[Mended], touched: Bool
 ) -> Trajectory:
     """Move the poses from the begin of the drift to the step by a cubic, so that they join those after it."""
     begin, at, beside = step
@@ -338,7 +334,7 @@ def _side(trajectory: Trajectory, at: int, epoch: int, reference: Rotation, sign
 
 
 def _without_jitter(
-    trajectory: Trajectory, span: tuple[int, int], config: SplineConfig, changes: list[Mended], touched: Flags
+    trajectory: Trajectory, span: tuple[int, int], config: SplineConfig, changes: list[Mended], touched: Bool
 ) -> Trajectory:
     """Replace the poses of a span by a weighted cubic B-spline, with smooth transitions at both ends."""
     first, last = span
@@ -397,7 +393,7 @@ def _smoothed_turns(seconds: Float64, turns: Rotation, weights: Float64, knot_s:
     return vectors
 
 
-def _filled(trajectory: Trajectory, config: SplineConfig, changes: list[Mended], touched: Flags) -> Smoothed:
+def _filled(trajectory: Trajectory, config: SplineConfig, changes: list[Mended], touched: Bool) -> Smoothed:
     """Fill gaps up to `fill_gap_s` by Hermite's cubic, at the trajectory's usual rate."""
     epochs = trajectory.epochs_gps_ns
     steps = np.diff(epochs)
@@ -571,6 +567,6 @@ def _moving_median(values: Float64, width: int) -> Float64:
     return medians
 
 
-def _closed(flags: Flags, width: int) -> Flags:
+def _closed(flags: Bool, width: int) -> Bool:
     """Return flags with holes of up to `width` filled."""
     return np.asarray(binary_closing(np.pad(flags, width), structure=np.ones(width))[width:-width], dtype=bool)

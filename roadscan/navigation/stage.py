@@ -3,21 +3,31 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final
 
+import pyarrow as pa
+
+from roadscan.core.extras import can_draw
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
 from roadscan.ingest.ingest import survey_records
 from roadscan.ingest.planned_logs import logs_of
+from roadscan.navigation.ppk_picture import COLUMNS, PpkPicture, draw_ppk
 from roadscan.navigation.tasks.clock_tables import set_damaged_clocks_aside
 from roadscan.navigation.tasks.clocks import estimate_clocks
 from roadscan.navigation.tasks.navigate import navigate, records_of
 from roadscan.navigation.tasks.navigation_status import navigation_status, trajectory_findings
-from roadscan.navigation.tasks.ppk_pictures import draw_post_processed
+from roadscan.navigation.tasks.recorded_pictures import keep_file, remove_others
+from roadscan.run.code_reach import code_digest
+from roadscan.run.engine.fingerprint import key_of
 from roadscan.run.session import Session, manifest_of
 from roadscan.run.stage import Stage, StageState
 from roadscan.store.logs import LogRecord, read_log_records
 from roadscan.store.manifest import MISSING, Manifest
+from roadscan.store.readings.row_groups import read_groups
+from roadscan.store.store import Store
 
 
 class Navigate(Stage):
@@ -61,3 +71,53 @@ class Navigate(Stage):
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
         """Return computed trajectories that their measurements contradict."""
         return trajectory_findings(records)
+
+
+PPK_PICTURE: Final = "ppk_picture"
+"""Product of the records."""
+_FOLDER: Final = "products/navigation"
+PPK: Final = "ppk"
+"""Format of the logs, and entry of their records with the figures."""
+
+
+def ppk_picture_path(record: LogRecord) -> str:
+    """Return the path of the picture of a log, relative to the survey's root."""
+    return f"{_FOLDER}/{_unit(record)}.png"
+
+
+def _unit(record: LogRecord) -> str:
+    return f"{record.run}-{record.sensor}-{PPK}-{record.key[:8]}"
+
+
+def draw_post_processed(
+    survey: Survey, store: Store, records: Sequence[LogRecord], report: Callable[[str], None]
+) -> None:
+    """Draw the pictures of logs that were post-processed which are missing, damaged or stale; remove others.
+
+    Without Matplotlib there are none.
+
+    Parameters
+    ----------
+    records : of the survey's logs.
+    """
+    own = {_unit(one): one for one in records if one.format == PPK and PPK in one.attributes} if can_draw() else {}
+    if not own and not store.files(_FOLDER):
+        return
+    manifest = Manifest(store)
+    remove_others(manifest, PPK_PICTURE, own)
+    for unit, record in own.items():
+        title = f"{survey.config.id}, run {record.run}, {record.path}"
+        key = key_of(code_digest("roadscan.navigation.ppk_picture"), title, record.key)
+        files = record.tables.get("gnss", ())
+        if manifest.is_current(PPK_PICTURE, unit, key) or not files:
+            continue
+        rows = pa.concat_tables(
+            [read_groups(store, one.path, range(len(one.group_rows)), list(COLUMNS)) for one in files]
+        )
+        picture, target = PpkPicture.of(title, rows, record.attributes[PPK]), ppk_picture_path(record)
+
+        def write(path: Path, picture: PpkPicture = picture) -> None:
+            draw_ppk(path, picture)
+
+        keep_file(store, manifest, (PPK_PICTURE, unit), key, target, write)
+        report(f"drawn: {target}")

@@ -10,15 +10,11 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.compute.robust import scatter_about
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.poses.leaps import rotation_vectors
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 SAMPLES_PER_S: Final = 200
 """Most samples per second that are compared: a link then lasts 5 ms, as in a usual trajectory."""

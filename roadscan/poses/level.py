@@ -5,13 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.crs import MapFrame
 from roadscan.poses.trajectory import Poses, Trajectory, world_from_ned
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _STEP_M = 10.0  # Length (m) of the line to true north whose map direction gives the convergence.
 

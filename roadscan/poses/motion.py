@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.compute.flags import runs_of
 from roadscan.compute.robust import scatter_about
 from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
@@ -21,10 +21,6 @@ from roadscan.core.frames import rotation_from_quaternion, rph_from_rotation
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.poses.leaps import PoseTrack
 from roadscan.poses.trajectory import Trajectory, world_from_ned
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 ANGLES: Final = ("roll", "pitch", "heading")
 VALUES: Final = ("height", *ANGLES)

@@ -6,11 +6,9 @@ from dataclasses import dataclass
 from typing import Final, Self
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.rig import Mounting, Mountings
-
-Float64 = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,12 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
 from roadscan.core.errors import NavigationError
 from roadscan.core.frames import ENU_FROM_NED, ecef_from_ned
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.poses.kernels.poses import COEFFICIENTS, PoseIntervals, interpolate, interval_coefficients
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 STENCIL_KNOTS = 3
 """Number of knots beyond each end of a span that poses within it depend on."""

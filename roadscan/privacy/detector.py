@@ -7,15 +7,12 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, UInt8
 from roadscan.core.errors import ConfigError
 from roadscan.core.extras import cv2, needed
 from roadscan.privacy.hiding import Region
 from roadscan.privacy.settings import DetectorConfig
-
-UInt8 = npt.NDArray[np.uint8]
-Float64 = npt.NDArray[np.float64]
 
 _OVERLAP: Final = 0.25  # Windows overlap by this share of their sides.
 _GREY: Final = 114

@@ -7,8 +7,8 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import UInt8
 from roadscan.core.errors import ConfigError
 from roadscan.core.extras import cv2
 from roadscan.pictures.placed import Pictures
@@ -20,8 +20,6 @@ from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.run.session import Session, found_once
 from roadscan.store.digest import file_digest
-
-UInt8 = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False)

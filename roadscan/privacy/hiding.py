@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import UInt8
 from roadscan.core.extras import cv2
 
 KINDS: Final = ("vehicle", "person", "detected")
 """What is hidden: vehicles and people by their returns, and what a network finds."""
 
-UInt8 = npt.NDArray[np.uint8]
-Float64 = npt.NDArray[np.float64]
 
 _CELLS: Final = 6
 """The longer side of what is hidden keeps so many mean colours: a face or a plate cannot be told from them."""

@@ -18,6 +18,7 @@ from roadscan.assets.classes import PERSON, VEHICLE
 from roadscan.assets.settings import AssetsConfig
 from roadscan.assets.tasks.evidence import CLASSIFIED
 from roadscan.assets.tasks.plan import asset_grid
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.grid import Bounds, TileGrid
 from roadscan.core.ids import TileId
@@ -29,9 +30,6 @@ from roadscan.privacy.hiding import Region
 from roadscan.run.session import Session
 from roadscan.store.manifest import OutputRecord, read_recorded
 from roadscan.store.store import Store
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _WHAT: Final = {VEHICLE: "vehicle", PERSON: "person"}
 _WINDOW_S: Final = 0.2

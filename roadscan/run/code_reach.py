@@ -30,7 +30,7 @@ import re
 import secrets
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeAlias
 
@@ -55,13 +55,18 @@ CARRIERS: Final = (
     "roadscan.core.strict",
     "roadscan.core.survey:Survey",
     "roadscan.core.survey:SurveyConfig",
+    "roadscan.georeference.plan.plan:poses_plan_of",
     "roadscan.store.logs",
     "roadscan.store.manifest",
     "roadscan.store.records",
     "roadscan.store.store",
 )
 """Modules left out of the digest: they transport data and change no result. Settings are covered by their values, files
-by their digests."""
+by their digests, a plan by the keys of its sources."""
+
+ARRAY_TYPES: Final = "roadscan.compute.array_types"
+"""Module whose definitions count as if each module that imports them had written them: short names for types of arrays.
+So a module may import such a name or write it, and its outputs stay current."""
 
 _EFFECTS = "<statements>"
 """Name for the statements of a module that define nothing: every user of the module depends on them."""
@@ -199,8 +204,13 @@ def _module(name: str) -> _Module:
         raise LookupError(f"there is no module {name}")
     outline = _outline_of(name, file.read_bytes(), _package_of(name, file))
     imports, libraries = _meant(outline.brought)
-    module = _Module(shapes={_EFFECTS: []}, imports=imports)
-    known = {one.name: (name, one.name) for one in outline.definitions}
+    written = {
+        own: [replace(shape, uses={str(inside): (name, own)}) for shape in _module(source).shapes[str(inside)]]
+        for own, (source, inside) in imports.items()
+        if source == ARRAY_TYPES
+    }
+    module = _Module(shapes={_EFFECTS: [], **written}, imports=imports)
+    known = {one: (name, one) for one in (*written, *(one.name for one in outline.definitions))}
     for own, text, names, brought in outline.definitions:
         within, within_libraries = _meant(brought)
         ours = imports | known | within

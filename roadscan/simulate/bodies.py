@@ -7,13 +7,11 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.simulate.kernels import things as body
 from roadscan.simulate.scene.roadside import Barrier
 from roadscan.simulate.surface import Surface
-
-Float64 = npt.NDArray[np.float64]
 
 PIECE_M: Final = 2.0
 """Barriers follow the road in straight pieces no longer than this (m)."""

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.errors import ConfigError
 from roadscan.core.gpstime import NS_PER_S, gps_ns_from_utc
 from roadscan.simulate.earth import Earth
@@ -22,8 +22,6 @@ from roadscan.simulate.surface import Surface
 
 __all__ = ["RUN_UP_S", "Drive", "Poses", "drives_of"]
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _HEAVE_HZ, _ROLL_HZ, _PITCH_HZ, _YAW_HZ = 1.3, 0.9, 1.6, 0.35  # frequencies of the body's motion on its springs
 _PITCH_SHARE: Final = 0.7  # amplitude of pitch as a share of that of roll

@@ -7,16 +7,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import pyproj
 from pyproj.exceptions import CRSError as ProjCrsError
 from scipy.spatial.transform import Rotation
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import ConfigError
 from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2
-
-Float64 = npt.NDArray[np.float64]
-
 
 LOCAL: Final = "local"
 """CRS of a frame with x to the right of y, z up, that is not tied to the Earth: flat, and at rest."""

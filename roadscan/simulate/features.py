@@ -7,15 +7,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial import Voronoi
 
+from roadscan.compute.array_types import Float64
 from roadscan.simulate.kernels.road import NODE_STEP_M
 from roadscan.simulate.kernels.things import RING_FROM, RING_TO
 from roadscan.simulate.noise import stream
 from roadscan.simulate.scene.road import Alligator, Joints, Patch, Ravelling, Road, Slabs
-
-Float64 = npt.NDArray[np.float64]
 
 _FACE_M = 0.001
 """Width of a slab's face, seen from above (m)."""

@@ -5,12 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-import numpy as np
-import numpy.typing as npt
-
 from roadscan.simulate.bodies import BURIED_M, Assembly
-
-Float64 = npt.NDArray[np.float64]
 
 _BELOW: Final = -BURIED_M
 

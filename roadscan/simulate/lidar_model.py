@@ -8,13 +8,10 @@ from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.strict import Strict, load_toml
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 FOLDER: Final = Path(__file__).parent / "lidars"
 

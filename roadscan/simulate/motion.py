@@ -14,13 +14,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 from scipy.interpolate import PPoly
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import ConfigError
 from roadscan.simulate.scene import PassScene, Vehicle
-
-Float64 = npt.NDArray[np.float64]
 
 RUN_UP_S: Final = 0.6
 """Time driven before the first and after the last profile (s); the trajectory covers it."""

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import lfilter
 
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 
 def stream(seed: int, run: int, purpose: str, block: int = 0) -> np.random.Generator:

@@ -9,18 +9,16 @@ import math
 from typing import Final, Protocol
 
 import numpy as np
-import numpy.typing as npt
 from scipy.interpolate import BSpline, CubicSpline, make_interp_spline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import ConfigError
 from roadscan.simulate.earth import Earth
 from roadscan.simulate.kernels.road import NODE_STEP_M
 from roadscan.simulate.scene import Route, Scene
 from roadscan.simulate.surface import Surface
-
-Float64 = npt.NDArray[np.float64]
 
 _WANDER_WAVES_M: Final = (83.0, 31.0)  # wavelengths of the driver's wander
 _STEP_M: Final = 0.25

@@ -14,9 +14,8 @@ import numpy.typing as npt
 from scipy.linalg import expm
 from scipy.signal import lfilter, ss2tf
 
+from roadscan.compute.array_types import Float64
 from roadscan.simulate.scene.road import Road
-
-Float64 = npt.NDArray[np.float64]
 
 STEP_M: Final = 0.1
 """Distance between samples along a track (m)."""

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float64
 from roadscan.simulate.bodies import (
     BURIED_M,
     PIECE_M,
@@ -58,8 +58,6 @@ from roadscan.simulate.scene.roadside import (
 from roadscan.simulate.semantics import SIGN, TRUNK, WALL
 from roadscan.simulate.surface import Surface
 from roadscan.simulate.vehicles import SIZES_M, vehicle_bodies
-
-Float64 = npt.NDArray[np.float64]
 
 _POST_RADIUS_M: Final = 0.03  # of posts of signs
 _RAIL_POST_RADIUS_M: Final = 0.05  # of posts of guardrails

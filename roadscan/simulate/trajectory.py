@@ -16,14 +16,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from scipy.spatial.transform import Rotation
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.gpstime import NS_PER_S, WEEK_S
 from roadscan.simulate.drive import Drive, Poses
 from roadscan.simulate.noise import GaussMarkov, stream
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.scene.rig import Outage
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 CHUNK_POSES: Final = 8_192  # poses of a chunk
 _DIFFERENCE_NS: Final = 2_000_000

@@ -6,17 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-import numpy as np
 import numpy.typing as npt
 import pyarrow.parquet as pq
 from pydantic import ValidationError
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import FormatError
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
 from roadscan.simulate.things import objects_table
-
-Float64 = npt.NDArray[np.float64]
 
 TRUTH_FOLDER: Final = "truth"
 SCENE_FILE: Final = "scene.json"

@@ -8,12 +8,10 @@ from collections.abc import Callable
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.simulate.bodies import Assembly, Place
 from roadscan.simulate.semantics import PERSON
-
-Float64 = npt.NDArray[np.float64]
 
 SIZES_M: Final = {
     "car": (4.4, 1.8, 1.5), "van": (5.4, 2.0, 2.4), "lorry": (8.5, 2.5, 3.6), "bicycle": (1.75, 0.6, 1.05),

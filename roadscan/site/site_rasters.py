@@ -16,6 +16,7 @@ from typing import Any, Final, Literal, NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float32
 from roadscan.core.errors import StoreError
 from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
@@ -25,7 +26,6 @@ from roadscan.tiles.products.hillshade import HillshadeOptions, shade
 from roadscan.tiles.products.pavement import IntensityOptions, ShadedOptions
 from roadscan.tiles.pyramid import overview_factors
 
-Float32 = npt.NDArray[np.float32]
 Raster: TypeAlias = Literal["height", "hillshade", "intensity", "pavement_intensity", "pavement_shaded"]
 RASTERS: Final[tuple[Raster, ...]] = ("height", "hillshade", "intensity")
 """Rasters of every survey."""

@@ -12,6 +12,7 @@ import numpy.typing as npt
 import shapely
 from PIL import Image
 
+from roadscan.compute.array_types import UInt8
 from roadscan.core.extras import cv2
 from roadscan.site.layer import SiteLayer, Style
 from roadscan.site.material import Box, Material
@@ -26,8 +27,6 @@ _SHIFT: Final = 4
 """Fractional bits of line coordinates: a sixteenth of a pixel."""
 _MOST_PICTURES: Final = 160
 """Most pictures of the tiles that are made; with more, only the layers are drawn."""
-
-UInt8 = npt.NDArray[np.uint8]
 
 
 def thumbnail(material: Material, box_m: Box, size_px: tuple[int, int], marked: Any = None) -> bytes:

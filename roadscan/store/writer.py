@@ -1,4 +1,9 @@
-"""Writes rows as sorted partitions of GPS time, in bounded memory."""
+"""Writes rows as sorted partitions of GPS time, in bounded memory.
+
+Computes columns from incoming rows, so that no log has to contain them.
+
+They stand beside the raw readings for their statistics: a reader learns what a row group holds without decoding it.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +21,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from roadscan.compute.kernels.profile_bounds import range_bounds
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.witness import Finding
-from roadscan.store.derived import with_derived
 from roadscan.store.digest import file_digest
 from roadscan.store.logs import DataFile, log_folder
 from roadscan.store.merge import merged
@@ -313,3 +318,17 @@ def describe(path: Path, relative: str) -> DataFile:
         group_rows=[g.num_rows for g in groups],
         group_spans=spans,
     )
+
+
+def with_derived(schema: TableSchema, rows: pa.RecordBatch) -> pa.RecordBatch:
+    """Return the rows of a table with computed derived columns, whatever these contained."""
+    if schema.name != "scans":
+        return rows
+    lists = rows.column("range")
+    ranges = lists.flatten().to_numpy().reshape(rows.num_rows, lists.type.list_size)
+    low, high = np.empty(rows.num_rows, np.uint16), np.empty(rows.num_rows, np.uint16)
+    range_bounds(ranges, low, high)
+    for name, values in (("range_low", low), ("range_high", high)):
+        at = rows.schema.get_field_index(name)
+        rows = rows.set_column(at, rows.schema.field(at), pa.array(values))
+    return rows

@@ -7,9 +7,8 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.strips.strip import ALONG_M
-
-Float64 = npt.NDArray[np.float64]
 
 FARTHEST_M: Final = 15.0
 """Lags are searched this far (m) to both sides: 0.9 s at 60 km/h."""

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Final, Self
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.ways import way_along
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 ALONG_M: Final = 0.1
 """Length of a cell (m): a clock that is 5 ms off moves readings by as much at 20 m/s."""

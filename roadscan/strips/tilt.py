@@ -14,14 +14,12 @@ from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple, Self
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.robust import scatter_about
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.poses.level import LevelPoses
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 Angle = Literal["roll", "pitch"]
 
 _BIN_NS: Final = NS_PER_S // 10

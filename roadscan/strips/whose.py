@@ -7,10 +7,8 @@ from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-Float64 = npt.NDArray[np.float64]
-Bool = npt.NDArray[np.bool_]
+from roadscan.compute.array_types import Bool, Float64
 
 MOST_FAULTS: Final = 3
 """At most this many errors are sought, the largest first."""

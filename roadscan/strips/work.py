@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.settings import AdjustConfig
 from roadscan.adjust.tasks.near import PlacedReadings, placed_readings
@@ -38,9 +37,6 @@ from roadscan.strips.lag import Lag, lag_of
 from roadscan.strips.strip import HALF_WIDTH_M, Strip, Way
 from roadscan.strips.tilt import Sway, Tilt, tilts_of
 from roadscan.tiles.tasks.tile_plan import tiles_of
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 PRODUCT: Final = "strips"
 """Name in the manifest of a stretch's comparisons; there is no file."""

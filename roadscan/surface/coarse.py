@@ -24,14 +24,12 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
+from roadscan.compute.array_types import Float64, UInt8
 from roadscan.compute.ways import way_along
 from roadscan.core.grid import QUANTA_PER_M, TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.strict import Strict
 from roadscan.surface.kernels import coarse as kernels
-
-Float64 = npt.NDArray[np.float64]
-UInt8 = npt.NDArray[np.uint8]
 
 NOTHING: Final = kernels.NOTHING
 MEASURED: Final = kernels.MEASURED

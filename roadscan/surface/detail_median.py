@@ -35,6 +35,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.surface.faint_cracks import REACH as STRIP_REACH
 from roadscan.surface.faint_cracks import Chains, no_strips
 from roadscan.surface.kernels.line_medians import (
@@ -47,11 +48,7 @@ from roadscan.surface.kernels.line_medians import (
     window_sums,
 )
 from roadscan.surface.kernels.supports import SUPPORTS, CrackCells, Shapes, heights_by_support, least_risk
-from roadscan.surface.smoothing_settings import SurfaceSmoothing
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
+from roadscan.surface.settings import SurfaceSmoothing
 
 _ABSENT = np.inf
 _HALF = CELLS // 2  # Cells of a line to either side of its middle.

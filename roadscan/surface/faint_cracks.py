@@ -21,8 +21,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float32, Float64, Int64
 from roadscan.surface.kernels.faint_cracks import (
     FIELDS,
     HALF_BREADTH,
@@ -38,12 +38,6 @@ from roadscan.surface.kernels.faint_cracks import (
     mark_peaks,
 )
 from roadscan.surface.kernels.line_medians import CELLS
-
-Float64 = npt.NDArray[np.float64]
-Float32 = npt.NDArray[np.float32]
-Int64 = npt.NDArray[np.int64]
-UInt8 = npt.NDArray[np.uint8]
-Bool = npt.NDArray[np.bool_]
 
 _CHAIN_SIGMAS = 4.0  # Least depth of a candidate chain (σ).
 _LEAST_CELLS = 3  # A median of fewer cells shows no depth.

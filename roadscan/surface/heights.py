@@ -3,15 +3,43 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64
 from roadscan.core.errors import RoadscanError
-from roadscan.surface.lowest import LowestReadings
+from roadscan.core.extras import cv2
 
-Float64 = npt.NDArray[np.float64]
-Bool = npt.NDArray[np.bool_]
+CROWD_CELLS: Final = 5
+"""The readings of a cell are compared with those of the cells within this distance (cells)."""
+_CROWD_TIMES: Final = 3
+"""A cell with more than this many times the mean number of readings around is crowded, as where a vehicle stood."""
+
+
+@dataclass(frozen=True)
+class LowestReadings:
+    """Lowest readings of a window; arrays (rows, columns)."""
+
+    drop_m: npt.NDArray[np.float32]
+    """Depth of a cell's lowest reading below its robust height (m), NaN where that is not known."""
+    count: npt.NDArray[np.uint16]
+    """Number of readings in the cell; 65,535 stands for all above."""
+
+    def part(self, rows: slice, columns: slice) -> LowestReadings:
+        """Returns some of the rows and columns, as views."""
+        return LowestReadings(self.drop_m[rows, columns], self.count[rows, columns])
+
+    def crowded(self) -> npt.NDArray[np.bool_]:
+        """Returns a mask of the cells with many times the readings of non-empty cells around, in whole numbers."""
+        side = (2 * CROWD_CELLS + 1,) * 2
+        around = cv2.boxFilter(self.count, cv2.CV_64F, side, None, (-1, -1), False, cv2.BORDER_CONSTANT)
+        cells = cv2.boxFilter(
+            (self.count > 0).view(np.uint8), cv2.CV_32S, side, None, (-1, -1), False, cv2.BORDER_CONSTANT
+        )
+        return np.asarray(self.count * cells.astype(np.float64) > _CROWD_TIMES * around)
+
 
 HEIGHT_STEP_M = 1e-5
 """Heights are whole multiples of this (m), so that sums do not depend on their order."""
@@ -107,7 +135,7 @@ class HeightWindow:
 
         A crack that takes in less than half of a cell is not in its height, but in its lowest reading. A single wrong
         reading decides that: it must not outweigh the cells around. Nor must cells with many times the readings of
-        those around them (``surface/lowest.py``): the lowest of 300 readings lies lower than that of 10.
+        those around them (``surface/heights.py``): the lowest of 300 readings lies lower than that of 10.
         """
         heights = self.cleaned_m()
         if self.lowest is None or most_m <= 0.0:

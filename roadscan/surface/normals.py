@@ -45,8 +45,7 @@ import numpy.typing as npt
 
 from roadscan.surface.kernels.spline_gradients import WORK, spline_gradients
 from roadscan.surface.kernels.vertex_gradients import FITTED, LEVEL, vertex_gradients
-from roadscan.surface.kernels.vertex_neighbourhoods import MOST, neighbourhoods
-from roadscan.surface.kernels.vertex_rings import MOST_RINGS
+from roadscan.surface.kernels.vertex_neighbourhoods import MOST, MOST_RINGS, neighbourhoods
 from roadscan.surface.settings import SlopeKind
 from roadscan.surface.sites import Sites
 from roadscan.surface.triangulation import Triangulation

@@ -4,6 +4,14 @@ A tile is computed on a window that reaches beyond it: by the cells of the neigh
 (:data:`SHOWN_M`; before smoothing, where they ask for more, farther), by those that smoothing depends on, and, for
 points, by those that triangles depend on. The outer ones are cut off again, so all that is left has the same bits in
 every tile that sees it.
+
+Detailed model: a smooth surface through every point of a region, evaluated on a fine grid.
+
+Stages, each a module: ``sites`` (order, duplicates), ``triangulation`` (Delaunay, holes left open), ``normals``
+(slopes), ``clough_tocher`` (cubic triangles, and their heights on a grid).
+
+Seams: a height depends on points within :attr:`DetailedSettings.halo_m` only. Two regions that both hold all points
+within that distance of a node give it the same height, to the bit, whatever else they hold and in whatever order.
 """
 
 from __future__ import annotations
@@ -11,29 +19,30 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field
 
+from roadscan.compute.array_types import Bool, Float32, Float64
 from roadscan.core.grid import QUANTUM_M, Bounds, TileGrid
 from roadscan.core.ids import TileId
+from roadscan.core.strict import Strict
 from roadscan.georeference.cloud import TilePoints
-from roadscan.surface.detailed import DetailedSettings
+from roadscan.surface.heights import LowestReadings
 from roadscan.surface.holes import RIM, Holes, cells_across
-from roadscan.surface.lowest import LowestReadings
-from roadscan.surface.settings import SurfaceConfig
+from roadscan.surface.settings import SlopeKind, SurfaceConfig, SurfaceSmoothing
 from roadscan.surface.sites import sites
 from roadscan.surface.smoothing import halo_cells, smooth_surface
-from roadscan.surface.smoothing_settings import SurfaceSmoothing
 from roadscan.surface.tile import EMPTY, FILLED, INTERPOLATED, MEASURED, SurfaceTile
 from roadscan.surface.triangulation import triangulate
 from roadscan.surface.window import GridWindow
 from roadscan.tiles.cells import TileCells
 
-Float64 = npt.NDArray[np.float64]
-Float32 = npt.NDArray[np.float32]
-Bool = npt.NDArray[np.bool_]
+if TYPE_CHECKING:
+    from roadscan.surface.clough_tocher import CubicSurface
+
 
 SHOWN_M: Final = 1.15
 """Least margin of the neighbouring tiles that products read (m)."""
@@ -308,3 +317,60 @@ def _held(window: GridWindow, places_m: Float64) -> Bool:
     held = np.zeros((window.rows, window.columns), bool)
     held[row[own], column[own]] = True
     return held
+
+
+class DetailedSettings(Strict):
+    """How the detailed model is made."""
+
+    max_gap_m: float = Field(default=0.3, gt=0.0, le=100.0)
+    """Widest hole that is bridged: no surface is made where a disc of this diameter holds no point."""
+    slopes: SlopeKind = "cubic"
+    """`cubic` follows the ground as closely as the heights' noise allows; `quadratic` is the paper's."""
+
+    @property
+    def halo_m(self) -> float:
+        """Returns the distance within which all points must be given for a height to be final (m).
+
+        A node's triangle and those beside it reach 2 gaps from it, the neighbours of their corners a gap a ring, and
+        the circles that decide about the last ring are counted in that ring.
+        """
+        from roadscan.surface.normals import RINGS
+
+        return (2 + RINGS) * self.max_gap_m
+
+
+def surface_through(points_m: npt.NDArray[np.float64], settings: DetailedSettings) -> CubicSurface:
+    """Returns the surface through points (n, 3): easting, northing, height (m, map frame), in any order.
+
+    Points at one place (to 10 µm) are merged to their mean height. Without three points that are not on a line the
+    surface has no triangles.
+
+    Raises
+    ------
+    RoadscanError
+        Where a coordinate is not finite.
+    """
+    from roadscan.surface.clough_tocher import cubic_surface
+    from roadscan.surface.normals import slopes_at
+
+    places = sites(points_m)
+    mesh = triangulate(places, settings.max_gap_m)
+    return cubic_surface(places, mesh, slopes_at(places, mesh, settings.slopes).slopes)
+
+
+def detailed_surface(
+    points_m: npt.NDArray[np.float64], window: GridWindow, settings: DetailedSettings
+) -> npt.NDArray[np.float64]:
+    """Heights (rows, columns) of a window's nodes (m, map frame), south row first, NaN where there is no surface.
+
+    Parameters
+    ----------
+    points_m : (n, 3) easting, northing, height (m, map frame), in any order: those of the window and of its halo
+        (:attr:`DetailedSettings.halo_m`), or all there are.
+
+    Raises
+    ------
+    RoadscanError
+        Where a coordinate is not finite.
+    """
+    return surface_through(points_m, settings).heights(window)

@@ -22,12 +22,10 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
+from roadscan.compute.array_types import Bool, Float64
 from roadscan.surface.coarse import CoarseModel
 from roadscan.surface.kernels.coarse import PATCH_SUMS, sum_patches
-from roadscan.surface.region_settings import RegionSettings
-
-Float64 = npt.NDArray[np.float64]
-Bool = npt.NDArray[np.bool_]
+from roadscan.surface.settings import RegionSettings
 
 FOUND: Final = "found"
 STATED: Final = "stated"

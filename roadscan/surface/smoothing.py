@@ -54,18 +54,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float32, Float64, UInt8
 from roadscan.core.errors import RoadscanError
 from roadscan.surface.detail_median import REACH as MEDIAN_REACH
 from roadscan.surface.detail_median import detail_median
-from roadscan.surface.kernels.directional_filters import choose_filters
 from roadscan.surface.kernels.smoothing import REACH as STEP_REACH
-from roadscan.surface.kernels.smoothing import descend
-from roadscan.surface.smoothing_settings import SurfaceSmoothing
-
-Float64 = npt.NDArray[np.float64]
-Float32 = npt.NDArray[np.float32]
-UInt8 = npt.NDArray[np.uint8]
-Bool = npt.NDArray[np.bool_]
+from roadscan.surface.kernels.smoothing import choose_filters, descend
+from roadscan.surface.settings import SurfaceSmoothing
 
 FILTER_BOUND = 38.0 / 21.0
 """Upper bound of the spectral norm of SᵀS for one filter a cell, any cells missing."""

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from roadscan.core.ids import TileId
 from roadscan.surface.coarse import FILLED, INTERPOLATED, MEASURED, NOTHING
-from roadscan.surface.lowest import LowestReadings
+from roadscan.surface.heights import LowestReadings
 from roadscan.surface.window import GridWindow
 
 EMPTY: Final = NOTHING

@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Int32, Int64
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.georeference.flat_profiles import flat_profiles
 from roadscan.georeference.kernels.flat_profiles import FlatProfiles
@@ -24,9 +25,6 @@ from roadscan.tiles.kernels.row_buckets import Buckets
 
 _EIGHT_BITS: Final = np.uint32(EIGHT_TO_SIXTEEN_BITS)
 _SIXTEEN_BITS: Final = np.uint32(1)  # Factor on intensities that have 16 bits already.
-
-Int32 = npt.NDArray[np.int32]
-Int64 = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)

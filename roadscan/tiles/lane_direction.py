@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Final, Self
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
+
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-Float64 = npt.NDArray[np.float64]
 
 STEP_M: Final = 1.0
 """Directions are those of steps of about this length."""

@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 
 from roadscan.adjust.patches import PassReadings
 from roadscan.adjust.places import Place, Traverse
-from roadscan.simulate.texture import texture_field
+from roadscan.simulate.surface import texture_field
 
 EASTING_M, NORTHING_M, HEADING_RAD = 512_345.0, 5_012_345.0, 0.3
 PLACE = Place(7, EASTING_M, NORTHING_M, HEADING_RAD, 0.5, (Traverse(0, "a", 0, 1), Traverse(1, "a", 0, 1)))

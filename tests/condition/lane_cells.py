@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from roadscan.condition.cell_table import cell_table
 from roadscan.condition.kernels.sampling import CellTable
 from roadscan.condition.road_line import Lane, RoadLine
+from roadscan.condition.tasks.stretches import cell_table
 from roadscan.core.ids import TileId
 from roadscan.simulate import Scene
 from roadscan.simulate.surface import Surface

@@ -7,7 +7,7 @@ import pytest
 import shapely
 from scipy.stats import norm
 
-from roadscan.condition.comparison import change_of, matched_sections
+from roadscan.condition.tasks.compare import change_of, matched_sections
 
 
 def line(x0: float, x1: float, y: float = 0.0) -> shapely.LineString:

@@ -12,7 +12,7 @@ from roadscan.condition.profiles.iri import half_car_ride, iri_of, mean_roughnes
 from roadscan.condition.profiles.quarter_car import SPEED_M_PER_S
 from roadscan.condition.profiles.ride import ride
 from roadscan.condition.profiles.segments import Segments, segments_of
-from roadscan.condition.stretches import stretches_above
+from roadscan.condition.profiles.tables import stretches_above
 from roadscan.core.errors import ProfileError
 
 K1, K2, C, MU = 653.0, 63.3, 6.0, 0.15

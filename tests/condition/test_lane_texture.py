@@ -16,7 +16,7 @@ from roadscan.condition.kernels.sampling import MOST_CELLS, Cells, CellTable, ga
 from roadscan.condition.on_lane.lines import lane_lines
 from roadscan.condition.on_lane.ravelling import RavelledSection, lane_levels, ravelled_section
 from roadscan.condition.on_lane.squares import TextureSquares, texture_squares
-from roadscan.condition.profiles.mpd import mean_profile_depth
+from roadscan.condition.profiles.tables import mean_profile_depth
 from roadscan.condition.profiles.texture import texture_segments
 from tests.condition.lane_cells import LaneOfCells
 

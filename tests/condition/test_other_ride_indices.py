@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.signal import StateSpace, lsim, welch
 
-from roadscan.condition.kernels.straightedge import roll_beam, roll_wheel
+from roadscan.condition.kernels.steps import roll_beam, roll_wheel
 from roadscan.condition.profiles.ride_number import ride_number_of, ride_number_ride
 from roadscan.condition.profiles.segments import Segments, segments_of
 from roadscan.condition.profiles.spectrum import road_spectrum
 from roadscan.condition.profiles.straightedge import LENGTHS_M, straightedge_mm
-from roadscan.condition.stretches import stretches_above
+from roadscan.condition.profiles.tables import stretches_above
 from roadscan.core.errors import ProfileError
 
 

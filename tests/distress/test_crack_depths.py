@@ -19,8 +19,7 @@ from roadscan.distress.settings import CrackDetection, CrackJoining
 from roadscan.distress.valley_lines import LINE_HALF, flank_cells
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
-from roadscan.surface.heights import HeightWindow
-from roadscan.surface.lowest import LowestReadings
+from roadscan.surface.heights import HeightWindow, LowestReadings
 
 Float64 = npt.NDArray[np.float64]
 

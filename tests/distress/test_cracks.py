@@ -22,8 +22,7 @@ from roadscan.distress.skeleton_graph import SkeletonGraph, pruned
 from roadscan.distress.valleys import _boxes, _thinned, find_valleys
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
-from roadscan.surface.heights import HeightWindow
-from roadscan.surface.lowest import LowestReadings
+from roadscan.surface.heights import HeightWindow, LowestReadings
 
 CONFIG, JOINING = CrackDetection(), CrackJoining()
 CELL_M = 0.0025

@@ -17,8 +17,7 @@ from roadscan.cli import app
 from roadscan.compute.reference_line import ReferenceLine
 from roadscan.core.errors import ConfigError, FormatError, RunError
 from roadscan.core.survey import Survey
-from roadscan.export.curved_grid import CurvedHeights, fill_holes, inner_holes
-from roadscan.export.export_opencrg import CrgSettings, export_opencrg
+from roadscan.export.export_opencrg import CrgSettings, CurvedHeights, export_opencrg, fill_holes, inner_holes
 from roadscan.export.export_psi import PsiSettings, export_psi
 from roadscan.georeference.plan.plan import plan_survey
 from roadscan.ingest.ingest import ingest

@@ -26,8 +26,7 @@ from roadscan.core.survey import Survey
 from roadscan.flows.arrival import arrival, retried
 from roadscan.simulate import SimulatedSurvey
 from roadscan.store.store import Store
-from roadscan.survey.arrival.template import FleetTemplate
-from roadscan.survey.arrival.watched import Watched
+from roadscan.survey.arrival.watched import FleetTemplate, Watched
 from tests.flows.arriving import Fleet, manifest_of
 from tests.flows.prefect_server import PrefectApi
 from tests.object_store import served

@@ -16,7 +16,7 @@ from roadscan.footprints.row_groups import GroupsByTile
 from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
 from roadscan.store.manifest import OutputRecord
-from roadscan.tiles.tasks.tile_work import plan_tile_work
+from roadscan.tiles.stage import plan_tile_work
 from roadscan.tiles.tasks.tiles import TaskResult
 from tests.surveys import Simulated
 

@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import cont2discrete
 
 from roadscan.condition.kernels.quarter_car import roll
-from roadscan.condition.kernels.straightedge import roll_beam, roll_wheel
+from roadscan.condition.kernels.steps import roll_beam, roll_wheel
 from roadscan.condition.profiles.quarter_car import GOLDEN_CAR, RULES, SPEED_M_PER_S
 
 K1, K2, C, MU = 653.0, 63.3, 6.0, 0.15

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from roadscan.condition.cell_table import cell_table
 from roadscan.condition.kernels.road_frame import place
 from roadscan.condition.kernels.ruts import straightedge, stretched_wire, water, wire_places
 from roadscan.condition.kernels.sampling import CellTable, factorise, sample
 from roadscan.condition.kernels.steps import step_heights
+from roadscan.condition.tasks.stretches import cell_table
 from roadscan.core.ids import TileId
 from roadscan.tiles.cells import TileCells
 

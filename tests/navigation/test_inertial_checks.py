@@ -18,9 +18,9 @@ from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, WEEK_S
 from roadscan.core.imu import IMU_GRADES
 from roadscan.core.settings.smoothing import SmootherConfig
 from roadscan.navigation.inertial.checks import Prepared, prepared
-from roadscan.navigation.inertial.outcome import check_outcome
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings, VehicleSensors
 from roadscan.navigation.inertial.smoother import solve
+from roadscan.navigation.tasks.solve_trajectory import check_outcome
 from roadscan.simulate import Scene
 from roadscan.simulate.drive import drives_of
 from roadscan.simulate.earth import Earth

@@ -26,8 +26,8 @@ from roadscan.run.stage import Stage, stages
 from roadscan.simulate import simulate, truth
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
+from roadscan.surface.stage import plan_surface_work
 from roadscan.surface.tasks.surface_plan import SURFACE
-from roadscan.surface.tasks.surface_work import plan_surface_work
 from roadscan.survey.run import run_stages
 from tests.surface.test_surfaces import SURFACES, TwoThreads
 from tests.surveys import Lines, Simulated, changed, outputs, small_scene

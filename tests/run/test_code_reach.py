@@ -132,6 +132,23 @@ def test_a_file_that_moves_does_not_count(package: Path) -> None:
     assert digest() == before
 
 
+def test_a_type_of_arrays_counts_alike_whether_written_or_imported(package: Path) -> None:
+    """In two modules, so that one definition for both would number all that follow otherwise."""
+    imported = "from roadscan.compute.array_types import Float64\n"
+    written = "import numpy as np\nimport numpy.typing as npt\nFloat64 = npt.NDArray[np.float64]\n"
+    files = [package / "origin.py", package / "late.py"]
+    texts = [
+        (package / "origin.py").read_text().replace("helper(size)", "helper(size: Float64)"),
+        (package / "late.py").read_text().replace("late()", "late() -> Float64"),
+    ]
+    digests = []
+    for head in (written, imported, written.replace("float64", "float32")):
+        for file, text in zip(files, texts, strict=True):
+            file.write_text(head + text)
+        digests.append(digest())
+    assert digests[0] == digests[1] != digests[2]
+
+
 def test_another_function_of_a_library_counts(package: Path) -> None:
     maker = package / "maker.py"
     maker.write_text("from math import floor as whole\n" + maker.read_text().replace("late()", "whole(late())"))
@@ -169,6 +186,14 @@ def test_the_tiles_reach_what_shapes_them_and_no_settings_of_other_stages() -> N
         for p in reached
         if p.startswith(("roadscan.core.settings.smoothing:Smoother", "roadscan.core.settings.calibration:C"))
     ]
+
+
+def test_the_adjustment_reaches_no_code_that_planned_its_sources() -> None:
+    """Logs and trajectories count by the keys of the sources that come of them."""
+    modules = {p.partition(":")[0] for p in reached_code(["roadscan.adjust.tasks.adjustment:adjust_survey"])}
+    assert {"roadscan.adjust.estimation", "roadscan.adjust.control.control", "roadscan.georeference.place"} <= modules
+    rooms = ("ingest.planned_logs", "ingest.inspect", "navigation.inertial", "navigation.odometry", "simulate")
+    assert not [m for m in modules if m.startswith(tuple(f"roadscan.{room}" for room in rooms))]
 
 
 def test_outlines_are_kept_for_the_next_process(package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

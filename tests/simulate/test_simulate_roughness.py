@@ -11,8 +11,7 @@ from scipy.signal import welch
 
 from roadscan.simulate import Scene
 from roadscan.simulate.roughness import STEP_M, accumulated_iri, iri_m_per_km, track_offsets_m
-from roadscan.simulate.surface import Surface
-from roadscan.simulate.texture import CELL_M, mean_profile_depth_mm, texture_field
+from roadscan.simulate.surface import CELL_M, Surface, mean_profile_depth_mm, texture_field
 
 
 def test_iri_of_the_world_banks_triangle(recordings: Path):

@@ -38,7 +38,7 @@ from roadscan.run.stage import stages
 from roadscan.simulate import simulate, truth
 from roadscan.site import web_part
 from roadscan.site.document import json_bytes
-from roadscan.site.edit_door import EditDoor
+from roadscan.site.doors import EditDoor
 from roadscan.site.layer import BELOW_TO_ABOVE, title_of
 from roadscan.site.live import LiveSite, open_survey
 from roadscan.site.material import Material, Wishes, box_from_text, box_of_road

@@ -10,8 +10,8 @@ from scipy.spatial import Delaunay
 from roadscan.core.errors import ConfigError, RoadscanError
 from roadscan.core.grid import Bounds
 from roadscan.surface.clough_tocher import CubicSurface, cubic_surface
-from roadscan.surface.detailed import DetailedSettings, detailed_surface, surface_through
 from roadscan.surface.normals import slopes_at
+from roadscan.surface.reconstruction import DetailedSettings, detailed_surface, surface_through
 from roadscan.surface.sites import sites
 from roadscan.surface.triangulation import triangulate
 from roadscan.surface.window import GridWindow

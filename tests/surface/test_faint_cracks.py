@@ -16,9 +16,8 @@ from roadscan.surface.kernels.faint_cracks import (
     line_depths,
     mark_peaks,
 )
-from roadscan.surface.settings import SurfaceConfig
+from roadscan.surface.settings import SurfaceConfig, SurfaceSmoothing
 from roadscan.surface.smoothing import Smoothing, smooth_surface
-from roadscan.surface.smoothing_settings import SurfaceSmoothing
 from tests.surface.patches import (
     IMPULSES,
     PROFILER_5,

@@ -9,9 +9,8 @@ from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
 from roadscan.surface import reconstruction
 from roadscan.surface.reconstruction import Patch, SurfaceGrid, surface_of
-from roadscan.surface.settings import SurfaceConfig
+from roadscan.surface.settings import SurfaceConfig, SurfaceSmoothing
 from roadscan.surface.smoothing import halo_cells, smooth_surface
-from roadscan.surface.smoothing_settings import SurfaceSmoothing
 
 
 def test_strips_have_the_bits_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:

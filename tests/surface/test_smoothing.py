@@ -11,8 +11,8 @@ from roadscan.core.errors import RoadscanError
 from roadscan.surface.detail_median import REACH, detail_median, detail_pairs, lines_onward
 from roadscan.surface.kernels.line_medians import judge_lines, line_means, line_medians, mirrored_line_medians
 from roadscan.surface.kernels.supports import CrackCells, Shapes, heights_by_support, least_risk
+from roadscan.surface.settings import SurfaceSmoothing
 from roadscan.surface.smoothing import FILTER_BOUND, Smoothing, halo_cells, smooth_surface, steps
-from roadscan.surface.smoothing_settings import SurfaceSmoothing
 from tests.surface.patches import (
     PROFILER_1,
     PROFILER_5,

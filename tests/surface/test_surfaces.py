@@ -33,8 +33,8 @@ from roadscan.store.manifest import Manifest
 from roadscan.store.query.sql import query
 from roadscan.store.store import Store
 from roadscan.surface.reconstruction import patch_of_cells, surface_of
+from roadscan.surface.stage import plan_surface_work
 from roadscan.surface.tasks.surface_plan import SURFACE, SurfacePlan, SurfaceTask, bridged_tiles
-from roadscan.surface.tasks.surface_work import plan_surface_work
 from roadscan.surface.tasks.surfaces import _Cells, source_of
 from roadscan.surface.tile import EMPTY, FILLED, INTERPOLATED, MEASURED, SurfaceTile
 from roadscan.survey.run import run_stages

@@ -34,8 +34,8 @@ from roadscan.store.query.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.status import survey_status, verify_store
 from roadscan.tiles.blocks import Block
+from roadscan.tiles.stage import plan_tile_work
 from roadscan.tiles.tasks.tile_points import load_points
-from roadscan.tiles.tasks.tile_work import plan_tile_work
 from tests.conftest import REPOSITORY
 from tests.surveys import Simulated, changed, outputs
 

@@ -9,7 +9,7 @@ import pytest
 
 from roadscan.footprints.footprints import FootprintRanges
 from roadscan.footprints.row_groups import GroupsByTile
-from roadscan.tiles.tasks.stretches import DrivenTiles, cut_stretches
+from roadscan.tiles.tasks.tile_plan import DrivenTiles, cut_stretches
 
 
 def driven(tiles: int, beyond: int) -> DrivenTiles:

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.crs import MapFrame
+from roadscan.site.cloud_file import Cube, NodeCutter
 from roadscan.site.layer import title_of
-from roadscan.site.octree import Cube, NodeCutter
 from roadscan.site.parts import edits
 from roadscan.store.codecs.copc import CopcWriter
 from roadscan.store.codecs.mesh import Mesh, write_glb

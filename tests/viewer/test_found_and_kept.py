@@ -16,9 +16,9 @@ import pytest
 import shapely
 
 from roadscan.core.crs import MapFrame
-from roadscan.site.degrees import degrees_on_map
 from roadscan.site.document import json_bytes
 from roadscan.site.layers.control import _RESIDUAL_STYLES
+from roadscan.site.site import degrees_on_map
 from tests.viewer.conftest import FolderSite, go_to
 from tests.viewer.street import EAST_M, NORTH_M
 from tests.viewer.test_edits import STILL, Opened, choose, correct, opened, send

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.observations import FIXED, KINDS, MOUNTED, Observations, mount_partials, partials
 from roadscan.adjust.patches import PassReadings, level_from_map, map_from_level
@@ -18,12 +17,10 @@ from roadscan.adjust.targets.line import find_line
 from roadscan.adjust.targets.settings import TargetSettings
 from roadscan.adjust.targets.shapes import Shape, SurveyedLine
 from roadscan.adjust.targets.values import ExpectedTarget, HeightFind, TargetFind, TargetReadings
+from roadscan.compute.array_types import Float64
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.poses.mounting_change import MountingChange, Seat
 from roadscan.poses.trajectory import Corrections
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 SightStatus = Literal["found", "missed", "doubled", "moved", "picked", "height", "unseen"]
 """`height`: no target is looked for, the height alone was measured; `unseen`: not even that, or the pass did not see

@@ -7,13 +7,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.control.control import Sighting
 from roadscan.compute.robust import scatter_about
 from roadscan.core.counted import listed
-
-Float64 = npt.NDArray[np.float64]
 
 NAMED: Final = 8
 """At most this many points are named; of the rest the number is reported."""

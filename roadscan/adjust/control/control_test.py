@@ -13,13 +13,9 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.solver_settings import AdjustmentSettings, ControlRules
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
+from roadscan.compute.array_types import Bool, Float64, Int64
 
 HEIGHT, PLACE = "height", "place"
 COMPONENTS: Final = {HEIGHT: (2,), PLACE: (0, 1)}

@@ -10,12 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.targets.cells import Cells
 from roadscan.adjust.targets.shapes import Disc, Shape
-
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 _SURROUNDINGS = 1.4
 """Radius of the area that is correlated with a disc, in radii of the disc."""

@@ -10,14 +10,11 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.targets.cells import Cells
 from roadscan.adjust.targets.settings import TargetSettings
 from roadscan.adjust.targets.shapes import Chequered, Disc, Shape
-
-Float64 = npt.NDArray[np.float64]
-Bool = npt.NDArray[np.bool_]
+from roadscan.compute.array_types import Bool, Float64
 
 _SECTORS = 24  # Sectors around the centre in which an outline is sought.
 _TOLERANCE = 0.05

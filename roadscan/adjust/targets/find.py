@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.targets.candidates import Candidate, candidates
 from roadscan.adjust.targets.cells import Cells, cells_of, spacing_m
@@ -23,8 +22,7 @@ from roadscan.adjust.targets.pictures import picture_of
 from roadscan.adjust.targets.settings import TargetSettings
 from roadscan.adjust.targets.shapes import Chequered
 from roadscan.adjust.targets.values import ExpectedTarget, Status, TargetFind, TargetPicture, TargetReadings
-
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 _GRID_CELLS = 24
 """Cells of the search's grid along the size of a shape, where readings are dense enough."""

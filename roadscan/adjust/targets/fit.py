@@ -13,17 +13,13 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.kernels import target_shapes as kernels
 from roadscan.adjust.kernels.target_shapes import EAST, NORTH, SIZE, TURN, UNKNOWNS
 from roadscan.adjust.targets.cells import Cells
 from roadscan.adjust.targets.shapes import Disc, Shape
+from roadscan.compute.array_types import Float64
 from roadscan.compute.robust import scatter_about
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 _SECTORS: Final = 36
 """Sectors around the centre; labels of one sector are one piece of evidence."""

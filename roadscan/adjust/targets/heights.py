@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.targets.settings import TargetSettings
 from roadscan.adjust.targets.values import HeightFind, TargetReadings
+from roadscan.compute.array_types import Float64
 from roadscan.compute.robust import SIGMA_OF_MAD
-
-Float64 = npt.NDArray[np.float64]
 
 _LEAST_COUNT = 12  # With fewer readings there is no height.
 _CURVED_COUNT = 60  # From this many readings on, the surface has terms of second degree.

@@ -6,17 +6,14 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.targets.heights import height_at
 from roadscan.adjust.targets.settings import TargetSettings
 from roadscan.adjust.targets.shapes import SurveyedLine
 from roadscan.adjust.targets.values import HeightFind, TargetReadings
+from roadscan.compute.array_types import Bool, Float64
 from roadscan.compute.edges.painted_line import LINE_M, painted_line, without_lines
 from roadscan.compute.robust import scatter_about
-
-Float64 = npt.NDArray[np.float64]
-Bool = npt.NDArray[np.bool_]
 
 _SLICES: Final = 8
 """Slices along the line that are measured separately: their scatter gives the σ of their mean."""

@@ -7,8 +7,7 @@ import numpy.typing as npt
 
 from roadscan.adjust.targets.shapes import Disc, Shape
 from roadscan.adjust.targets.values import TargetPicture
-
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 _PIXELS_PER_SIZE = 48  # Pixels across half the size of a target.
 _MOST_PIXELS = 192  # Largest edge of an image (pixels).

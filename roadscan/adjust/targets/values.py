@@ -9,9 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.targets.shapes import Shape
-
-Float64 = npt.NDArray[np.float64]
-UInt8 = npt.NDArray[np.uint8]
+from roadscan.compute.array_types import Float64, UInt8
 
 Status = Literal["found", "missed", "doubled", "moved"]
 

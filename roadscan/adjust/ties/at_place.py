@@ -18,9 +18,8 @@ from roadscan.adjust.ties.height import height_tie
 from roadscan.adjust.ties.plane import plane_ties
 from roadscan.adjust.ties.shift import KINDS_OF_PICTURES, Pictures, shift_ties
 from roadscan.adjust.ties.tie import SAME_PASS, Tie
+from roadscan.compute.array_types import Float64
 from roadscan.core.gpstime import NS_PER_S
-
-Float64 = npt.NDArray[np.float64]
 
 _PARTNERS: Final = 2
 """Number of traverses to which each one is tied: all pairs of many passes would be redundant."""

@@ -13,9 +13,8 @@ import numpy.typing as npt
 
 from roadscan.adjust.tie_settings import AgainSettings, TieSettings
 from roadscan.adjust.ties.tie import HEIGHT, SHIFT
+from roadscan.compute.array_types import Bool, Float64
 
-Bool = npt.NDArray[np.bool_]
-Float64 = npt.NDArray[np.float64]
 Column = Mapping[str, npt.NDArray[Any]]
 
 _LEAST: Final = 3

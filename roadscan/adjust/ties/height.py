@@ -12,16 +12,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.patches import Patch, level_from_map, map_from_axes
 from roadscan.adjust.tie_settings import TieSettings
 from roadscan.adjust.ties.tie import COUNTS, FEW_CELLS, HEIGHT, SCATTERED, STEEP, TOO_FAR, TWO_SURFACES, End, Tie
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.compute.robust import scatter_about
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 _BLOCKS: Final = 6
 """Blocks along an edge whose means give the σ of a mean over the patch."""

@@ -14,18 +14,14 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.kernels.plane_moments import add_moments, leave_out_far
 from roadscan.adjust.patches import PassReadings, level_from_map
 from roadscan.adjust.places import Place
 from roadscan.adjust.tie_settings import TieSettings
 from roadscan.adjust.ties.tie import COUNTS, LASERS, PLANE, TOO_FAR, End, Tie
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.gpstime import NS_PER_S
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 _FLAT: Final = 0.25
 """Greatest ratio of a plane's thickness to its shorter extent."""

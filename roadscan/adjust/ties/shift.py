@@ -1,18 +1,28 @@
-"""Horizontal ties: shift of the relief or the paint of one traverse against that of another."""
+"""Horizontal ties: shift of the relief or the paint of one traverse against that of another.
+
+Registration of two images: the best correlation, its uniqueness, and the shift with its σ.
+
+The shift is that of least squares on the images (Lucas and Kanade 1981), with the slopes of both. Its covariance is
+made of two sums: the information, from products of one image's slopes with the other's, to which noise in the slopes
+adds nothing, and the scatter of the scores (slope times residual) of blocks of cells, which counts whatever the noise
+is, whether cells are correlated, and where it is larger (White 1980, clustered).
+"""
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
 
+from roadscan.adjust.kernels.correlation import Laid, correlate, lay_upon
 from roadscan.adjust.patches import Patch, level_from_map, map_from_axes
-from roadscan.adjust.pictures import Picture, pictures_of
-from roadscan.adjust.registration import Shift, disagree, shift_of
+from roadscan.adjust.pictures import BLUR_CELLS, Picture, pictures_of
 from roadscan.adjust.tie_settings import TieSettings
 from roadscan.adjust.ties.tie import SHIFT, End, Tie
+from roadscan.compute.array_types import Float64, Int64
 
 DISAGREE: Final = "relief and paint disagree"
 _DISAGREE_SIGMA: Final = 5.0  # Relief and paint contradict one another from this many σ on.
@@ -74,3 +84,260 @@ def _ties(first: Patch, second: Patch, shift: Shift, group: int) -> list[Tie]:
             Tie(SHIFT, ends, direction, value, float(sigma), shift.count, shift.correlation, shift.why_not, group)
         )
     return out
+
+
+UNLIKE: Final = "pictures are not alike"
+AT_EDGE: Final = "best shift at the edge of the search"
+AMBIGUOUS: Final = "another shift fits as well"
+FEATURELESS: Final = "no direction is known well enough"
+
+_SAMPLES: Final = 2500
+"""Approximate number of cells of the first image that are correlated."""
+_STEP: Final = 2
+"""Step of the search (cells): the images are smooth over more than that."""
+_LEAST_SHARE: Final = 0.25  # Shifts with a smaller share of the cells in common are not correlated.
+_LOBE_CELLS: Final = 4.0
+"""Correlations within this distance (cells) of the best one, along the known directions, belong to its peak."""
+_LEFT_OVER: Final = 2.0
+"""A rival shift fails if it leaves this many times the variance that the best shift leaves."""
+_ROUNDS: Final = 12  # Iterations of least squares, at most.
+_DONE_CELLS: Final = 0.01  # Steps below this (cells) end the iteration.
+_COARSE: Final = 3
+"""Stride of the cells used (rows and columns) until a step is short."""
+_NEAR_CELLS: Final = 0.05  # Steps above this (cells) use the coarse stride.
+_ASTRAY_CELLS: Final = 4.0  # A shift farther than this from its start (cells) has diverged.
+_HUBER: Final = 3.0  # Huber's limit for residuals (σ).
+_BLOCK_CELLS: Final = 8  # Edge of the blocks whose scores are summed (cells).
+_INDEPENDENT: Final = 4.0 * math.pi * (BLUR_CELLS**2 + 1.0 / 6.0)
+"""Number of cells that count as one independent value: area under the correlation of smoothed noise (bilinear too)."""
+_SHARP: Final = 9
+"""Exponent of cos² 2θ: an edge that leaves the axes by some degrees crosses the readings' grid at many positions."""
+_PRIOR_BLOCKS: Final = 4.0
+"""Weight of the noise of the whole image beside the scatter of the blocks, in blocks."""
+
+
+@dataclass(frozen=True)
+class Shift:
+    """The shift of the second image against the first."""
+
+    value_m: Float64
+    """(2,) along, across: position in the second image of a place of the first."""
+    directions: Float64
+    """(d,) unit vectors (along, across), d = 0, 1 or 2, in which it is known; components of it are independent."""
+    sigma_m: Float64
+    """(d,) 1 σ."""
+    felt_m: Float64
+    """(2,) along, across, from the middle of the image: weighted mean of the slopes that determine it."""
+    correlation: float
+    count: int
+    """Cells in common."""
+    why_not: str = ""
+    """Test that it failed; empty if it passed."""
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """Sums at one shift; components in the order (row, column), cells."""
+
+    step: Float64
+    """(2,) to the solution."""
+    common: Float64
+    """(2, 2) information of slopes common to both images."""
+    mean: Float64
+    """(2, 2) information of the mean slopes."""
+    score: Float64
+    """(n, 2) of cells: slope times residual."""
+    cell: Int64
+    """(2, n) row and column of each."""
+    expected: Float64
+    """(2, 2) covariance of the sum of scores if the noise were the same everywhere."""
+    felt: Float64
+    """(2,) row and column."""
+    aligned: float
+    """Share, 0 to 1, of the slopes aligned with the axes of the place, beyond that of any texture."""
+    correlation: float
+
+    @property
+    def scores(self) -> Float64:
+        """Covariance (2, 2) of the sum of scores, from blocks, with a few blocks' worth of the expected one."""
+        row, column = self.cell // _BLOCK_CELLS
+        _, number = np.unique(row * 4096 + column, return_inverse=True)
+        sums = np.stack([np.bincount(number, self.score[:, k]) for k in (0, 1)], axis=-1)
+        squares = np.einsum("bi,bi->b", sums, sums)
+        blocks = float(squares.sum() ** 2 / max(float(squares @ squares), 1e-300))
+        return np.asarray((blocks * sums.T @ sums + _PRIOR_BLOCKS * self.expected) / (blocks + _PRIOR_BLOCKS))
+
+
+def shift_of(one: Picture, other: Picture, settings: TieSettings) -> Shift:
+    """Returns the shift between two images of one place in cells of `settings.shift_cell_m`."""
+    first, second = one.value, other.value
+    reach = int(settings.search_m / settings.shift_cell_m) // _STEP
+    shifts = _STEP * np.arange(-reach, reach + 1)
+    every = max(1, math.ceil(len(first) / math.sqrt(_SAMPLES)))
+    least = int(_LEAST_SHARE * min(int(np.isfinite(picture).sum()) for picture in (first, second)) / every**2)
+    likeness = np.empty((shifts.size, shifts.size))
+    correlate(first, second, every, shifts, shifts, least, likeness)
+    if not np.isfinite(likeness).any():
+        return _nothing(UNLIKE, math.nan)
+    row, column = np.unravel_index(int(np.nanargmax(likeness)), likeness.shape)
+    best = float(likeness[row, column])
+    if best < settings.least_correlation:
+        return _nothing(UNLIKE, best)
+    start = np.array([shifts[row], shifts[column]], dtype=np.float64)
+    found = _refined(first, second, start)
+    if found is None:
+        return _nothing(FEATURELESS, best)
+    place, sums = found
+    shift = _known(place, sums, one.sampling_m2 + other.sampling_m2, len(first), settings)
+    return shift if shift.why_not else _tested(likeness, shifts, start, shift, settings)
+
+
+def _refined(first: Float64, second: Float64, start: Float64) -> tuple[Float64, _Equations] | None:
+    """Least-squares shift (row, column; cells) near a start and the sums there; None where there is none."""
+    place, edge = start.copy(), len(first)
+    laid = Laid(np.empty((edge, edge)), np.empty((edge, edge, 2)), np.empty((edge, edge, 2)))
+    found, coarse = None, True
+    for turn in range(_ROUNDS):
+        lay_upon(first, second, float(place[0]), float(place[1]), laid)
+        sums = _equations(first, laid, _COARSE if coarse else 1)
+        if sums is None:
+            return None
+        # A direction without information does not move.
+        place = place + np.clip(sums.step, -1.0, 1.0)
+        if np.abs(place - start).max() > _ASTRAY_CELLS:
+            return None
+        # In a direction that is hardly known the iteration need not converge.
+        moved = math.sqrt(float(sums.step @ sums.mean @ sums.step) / max(float(np.trace(sums.mean)), 1e-300))
+        if not coarse:
+            found = place, sums
+            if moved < _DONE_CELLS:
+                break
+        coarse = coarse and moved > _NEAR_CELLS and turn < _ROUNDS // 2
+    return found
+
+
+def _equations(first: Float64, laid: Laid, every: int) -> _Equations | None:
+    """Returns sums over each `every`-th cell that both saw.
+
+    Contrast and a surface of the second degree between the images are eliminated: each image lacks a surface
+    that was fitted to what its traverse saw, and the two saw different parts of a rut.
+    """
+    row, column = (every * index for index in np.nonzero(np.isfinite(laid.left[::every, ::every])))
+    if row.size < 64:
+        return None
+    left = laid.left[row, column]
+    own, other = laid.first_slope[row, column][:, ::-1], laid.second_slope[row, column][:, ::-1]
+    there = first[row, column] - left
+    half = 0.5 * len(first)
+    x, y = row / half - 1.0, column / half - 1.0
+    nuisance = np.stack([np.ones(row.size), x, y, x * x, x * y, y * y, there], axis=-1)
+    left, weight, sigma = _weighed(nuisance, left)
+    weighted = nuisance * weight[:, None]
+    stacked = np.concatenate([own, other], axis=1)
+    part = np.linalg.lstsq(weighted.T @ nuisance, weighted.T @ stacked, rcond=1e-12)[0]
+    slopes = stacked - nuisance @ part
+    own, other = slopes[:, :2], slopes[:, 2:]
+    mean_slope = 0.5 * (own + other)
+    mean = (mean_slope * weight[:, None]).T @ mean_slope
+    common = (own * weight[:, None]).T @ other
+    score = mean_slope * (weight * left)[:, None]
+    values, vectors = np.linalg.eigh(mean)
+    known = values > 1e-4 * max(values[1], 1e-300)
+    step = vectors[:, known] @ ((vectors[:, known].T @ score.sum(axis=0)) / values[known])
+    energy = np.einsum("ni,ni->n", mean_slope, mean_slope)
+    felt = np.array([energy @ row, energy @ column]) / max(energy.sum(), 1e-300)
+    # cos 4θ = cos² 2θ − sin² 2θ; its odd power is sharp, and 0 in the mean over all directions.
+    double = np.stack([mean_slope[:, 0] ** 2 - mean_slope[:, 1] ** 2, 2.0 * mean_slope[:, 0] * mean_slope[:, 1]])
+    along_axes = (double[0] ** 2 - double[1] ** 2) / np.maximum(energy, 1e-300) ** 2
+    aligned = float(np.clip((energy * along_axes**_SHARP).sum() / max(energy.sum(), 1e-300), 0.0, 1.0))
+    a, b = first[row, column], there
+    a, b = a - a.mean(), b - b.mean()
+    correlation = float(a @ b / max(math.sqrt(float(a @ a) * float(b @ b)), 1e-300))
+    expected = sigma**2 * _INDEPENDENT * mean
+    return _Equations(
+        step, 0.5 * (common + common.T), mean, score, np.stack([row, column]), expected, felt, aligned, correlation
+    )
+
+
+def _weighed(nuisance: Float64, left: Float64) -> tuple[Float64, Float64, float]:
+    """Returns residuals without contrast and surface; Huber's weights (n,); 1 σ of the residuals."""
+    weight = np.ones(left.size)
+    for _ in range(2):
+        weighted = nuisance * weight[:, None]
+        left = left - nuisance @ np.linalg.lstsq(weighted.T @ nuisance, weighted.T @ left, rcond=1e-12)[0]
+        sigma = math.sqrt(float(weight @ left**2) / float(weight.sum()))
+        weight = np.minimum(1.0, _HUBER * sigma / np.maximum(np.abs(left), 1e-300))
+    return left, weight, sigma
+
+
+def _known(place: Float64, sums: _Equations, sampling_m2: Float64, edge: int, settings: TieSettings) -> Shift:
+    """Returns the shift in metres, and the directions in which it is known."""
+    cell = settings.shift_cell_m
+    directions, sigma = _directions(sums, settings.coherence)
+    common = sums.aligned * np.einsum("di,ij,dj->d", directions, sampling_m2, directions)
+    sigma = np.sqrt((sigma * cell) ** 2 + common + settings.shift_floor_m**2)
+    good = sigma <= settings.most_shift_sigma_m
+    felt = (sums.felt + 0.5 - 0.5 * edge) * cell
+    why = "" if good.any() else FEATURELESS
+    return Shift(place * cell, directions[good], sigma[good], felt, sums.correlation, len(sums.score), why)
+
+
+def _directions(sums: _Equations, coherence: float) -> tuple[Float64, Float64]:
+    """Returns unit vectors (d, 2) of independent components of the shift and their σ (d,), cells.
+
+    With information `common` and scores of covariance S, the shift's error is common⁻¹ · score. Where one direction
+    has more noise than slopes in common, only the component along the other one remains.
+    """
+    values, scores = np.linalg.eigvalsh(sums.mean), sums.scores
+    if values[1] <= 0.0:
+        return np.zeros((0, 2)), np.zeros(0)
+    steady = sums.mean + 1e-9 * values[1] * np.eye(2)
+    lower = np.linalg.inv(np.linalg.cholesky(steady))
+    share, turn = np.linalg.eigh(lower @ sums.common @ lower.T)
+    kept = (lower.T @ turn)[:, (share >= coherence)]
+    if kept.shape[1] == 2:
+        inverse = np.linalg.inv(sums.common)
+        variance, vectors = np.linalg.eigh(inverse @ scores @ inverse)
+        return vectors.T, np.sqrt(np.maximum(variance, 0.0))
+    along = sums.common @ kept
+    length = np.linalg.norm(along, axis=0)
+    variance = np.einsum("id,ij,jd->d", kept, scores, kept)
+    return (along / length).T, np.sqrt(np.maximum(variance, 0.0)) / length
+
+
+def _tested(likeness: Float64, shifts: Int64, start: Float64, shift: Shift, settings: TieSettings) -> Shift:
+    """Returns a shift that lies inside the search, in the directions in which no other one fits as well."""
+    if (np.abs(shift.directions @ (shift.value_m / settings.shift_cell_m)) > shifts[-1] - _STEP).any():
+        return replace(shift, why_not=AT_EDGE)
+    if np.abs(start).max() >= shifts[-1] and len(shift.directions) == 2:
+        return replace(shift, why_not=AT_EDGE)
+    best = float(np.nanmax(likeness))
+    # A rival leaves little more unexplained than the best shift does.
+    least = max(settings.rival_share * best, math.sqrt(max(1.0 - _LEFT_OVER * (1.0 - best**2), 0.0)))
+    single = np.ones(len(shift.directions), bool)
+    for r, c in zip(*(n.tolist() for n in np.nonzero(np.nan_to_num(likeness, nan=-1.0) >= least)), strict=True):
+        if _is_summit(likeness, r, c):
+            single &= np.abs(shift.directions @ (np.array([shifts[r], shifts[c]]) - start)) <= _LOBE_CELLS
+    if not single.any():
+        return replace(shift, why_not=AMBIGUOUS)
+    return replace(shift, directions=shift.directions[single], sigma_m=shift.sigma_m[single])
+
+
+def _is_summit(likeness: Float64, row: int, column: int) -> bool:
+    """Returns whether no neighbour correlates better."""
+    around = likeness[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+    return bool(likeness[row, column] >= np.nanmax(around))
+
+
+def _nothing(why_not: str, correlation: float) -> Shift:
+    return Shift(np.full(2, np.nan), np.zeros((0, 2)), np.zeros(0), np.zeros(2), correlation, 0, why_not)
+
+
+def disagree(one: Shift, other: Shift, limit: float) -> bool:
+    """Returns whether two shifts of one pair differ by more than `limit` σ in a direction that both know."""
+    for (u, s), (v, t) in itertools.product(
+        zip(one.directions, one.sigma_m, strict=True), zip(other.directions, other.sigma_m, strict=True)
+    ):
+        if abs(float(u @ v)) > 0.9 and abs(float(u @ (one.value_m - other.value_m))) > limit * math.hypot(s, t):
+            return True
+    return False

@@ -6,12 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-import numpy.typing as npt
-
 from roadscan.adjust.patches import PassReadings
-
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 HEIGHT: Final = "height_tie"
 SHIFT: Final = "shift_tie"

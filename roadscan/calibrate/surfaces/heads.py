@@ -12,16 +12,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.calibrate.evidence import Seen, Ties, Traverse
 from roadscan.calibrate.surfaces.readings import Pieces, Placed, Readings, level_from_world, placed
 from roadscan.calibrate.unknowns import Estimate
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.robust import scatter_about
 from roadscan.core.errors import NavigationError
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _CELL_M: Final = 0.01  # Edge of a cell in which heights are compared.
 _LEAST: Final = 4  # Least number of readings of a cell, and least number of common cells.

@@ -22,12 +22,9 @@ from roadscan.calibrate.evidence import Seen, Ties, Traverse
 from roadscan.calibrate.kernels.surface_patches import MOMENTS, UNKNOWNS, Matches, match_patches, splat
 from roadscan.calibrate.surfaces.readings import Pieces, Placed, Readings, level_from_world, placed
 from roadscan.calibrate.unknowns import Estimate
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.errors import NavigationError
 from roadscan.core.strict import Strict
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 _BLUR_CELLS: Final = 1.5
 """Images are smoothed with a Gaussian of this σ. With less, interpolation between cells would damp their noise and

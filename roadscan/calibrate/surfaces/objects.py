@@ -13,16 +13,14 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
 from roadscan.calibrate.evidence import Known, Seen, Ties, Traverse
 from roadscan.calibrate.surfaces.readings import Pieces, Placed, Readings, level_from_world, placed
 from roadscan.calibrate.unknowns import Estimate, ObjectPose
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import NavigationError
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 Steps = Sequence[tuple[float, float, float]]
 
 KIND: Final = "object"

@@ -13,17 +13,14 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
 from roadscan.calibrate.evidence import Seen, Ties, Traverse
 from roadscan.calibrate.surfaces.readings import Pieces, Placed, Readings, level_from_world, placed
 from roadscan.calibrate.unknowns import Estimate
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.errors import NavigationError
 from roadscan.core.strict import Strict
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _KEY_BITS: Final = 16  # Bits of a cell's key for each of its three indices.
 _FLAT: Final = 0.25

@@ -8,18 +8,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.calibrate.evidence import Seen, Traverse
 from roadscan.calibrate.kernels.surface_patches import place
 from roadscan.calibrate.rotations import exponential
 from roadscan.calibrate.unknowns import Estimate
+from roadscan.compute.array_types import Float64, Int32, Int64
 from roadscan.core.errors import NavigationError
 from roadscan.core.gpstime import NS_PER_S
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Int32 = npt.NDArray[np.int32]
 
 
 @dataclass(frozen=True)

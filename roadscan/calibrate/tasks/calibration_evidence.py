@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.calibrate.evidence import Evidence, Seen, Traverse
 from roadscan.calibrate.reference import ReferenceOptions, register
@@ -19,6 +18,7 @@ from roadscan.calibrate.surfaces.planes import PlaneTies
 from roadscan.calibrate.surfaces.readings import Pieces, Readings
 from roadscan.calibrate.tasks.calibration_readings import Wanted, wanted_readings
 from roadscan.calibrate.unknowns import Estimate, ObjectPose
+from roadscan.compute.array_types import Float64
 from roadscan.core.crs import LOCAL_WORLD, MapFrame
 from roadscan.core.errors import ConfigError, RunError, nearest
 from roadscan.core.gpstime import Clock, TimeSystem
@@ -40,8 +40,6 @@ from roadscan.navigation.tasks.navigation_logs import imu_readings
 from roadscan.navigation.tasks.pose_sigma import usual_pose_sigma
 from roadscan.navigation.tasks.trajectories import load_trajectory
 from roadscan.poses.trajectory import world_from_ned
-
-Float64 = npt.NDArray[np.float64]
 
 Find = Callable[[Estimate], Sequence[Evidence]]
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.calibrate.surfaces.readings import Readings
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.errors import ConfigError, RunError, nearest
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.core.settings.calibration import Area
@@ -21,8 +22,6 @@ from roadscan.poses.trajectory import Trajectory
 from roadscan.store.logs import DataFile
 from roadscan.store.readings.returns import sensor_xyz_m
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 Span = tuple[int, int]
 
 MOST_READINGS: Final = 4_000_000

@@ -7,9 +7,8 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.compute.kernels.edge_across import best_path, step_and_bend
-
-Float64 = npt.NDArray[np.float64]
 
 
 class AcrossSettings(NamedTuple):

@@ -5,11 +5,9 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.compute.flags import runs_of
-
-Float64 = npt.NDArray[np.float64]
 
 LINE_M: Final = 0.6
 """Painted lines are narrower than this."""

@@ -29,14 +29,13 @@ from typing import ClassVar, Final, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.compute.robust import scatter_about
 from roadscan.condition.index import ConditionIndex, Quantity, Value
 from roadscan.condition.kernels.steps import step_heights
 from roadscan.condition.lane_data import LaneData, Profile
 from roadscan.condition.of_sections.wheel_paths import bridged
 from roadscan.condition.profiles.quarter_car import SEVERE_M
-
-Float64 = npt.NDArray[np.float64]
 
 _NEAR_M: Final = 0.1  # Lines are fitted from this distance …
 _FAR_M: Final = 0.5  # … to this distance before and behind a joint.

@@ -11,14 +11,12 @@ from collections.abc import Iterator
 from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.compute.robust import scatter_about
 from roadscan.condition.index import ConditionIndex, Quantity, Value
 from roadscan.condition.lane_data import LaneData
 from roadscan.condition.on_lane.lines import SPACING_M, LaneLines
-
-Float64 = npt.NDArray[np.float64]
 
 _AROUND_M: Final = 15.0  # Length before and behind a place over which middles of a line are used.
 _LEAST_PLACES: Final = 5  # Least number of these middles.

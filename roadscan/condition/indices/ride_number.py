@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from typing import ClassVar, Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.index import ConditionIndex, Quantity, Value
 from roadscan.condition.lane_data import LaneData
 from roadscan.condition.of_sections.wheel_paths import (
@@ -22,8 +22,6 @@ from roadscan.condition.of_sections.wheel_paths import (
     without_noise,
 )
 from roadscan.condition.profiles.ride_number import ride_number, ride_number_of, ride_number_ride
-
-Float64 = npt.NDArray[np.float64]
 
 _WIDEST_M: Final = 0.07
 """Largest standard deviation of the weights of a height's window: that of cells of 0.1 m."""

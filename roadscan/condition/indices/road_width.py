@@ -13,13 +13,11 @@ from collections.abc import Iterator, Sequence
 from typing import ClassVar, Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.index import ConditionIndex, How, PerCrossSection, Quantity, Value, by_section
 from roadscan.condition.lane_data import LaneData
 from roadscan.condition.road_edges.raster import STATION_M
-
-Float64 = npt.NDArray[np.float64]
 
 _MM: Final = 1e3  # Millimetres in a metre.
 

@@ -16,14 +16,12 @@ from collections.abc import Iterator
 from typing import ClassVar, Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.index import ConditionIndex, How, PerCrossSection, Quantity, Value, by_section
 from roadscan.condition.kernels.ruts import stretched_wire, water
 from roadscan.condition.lane_data import LaneData
 from roadscan.condition.of_sections.whole_sections import WholeSections
-
-Float64 = npt.NDArray[np.float64]
 
 _MM: Final = 1e3  # Millimetres in a metre.
 _WATER: Final = (

@@ -19,11 +19,10 @@ import numpy.typing as npt
 import scipy.ndimage
 from scipy.special import ndtr
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.lane_data import LaneData, Profile
 from roadscan.condition.profiles.quarter_car import RULES
 from roadscan.condition.profiles.segments import Segments
-
-Float64 = npt.NDArray[np.float64]
 
 LEAD_M: Final = 100.0
 """A quarter car starts this far before a section, or where the profile begins."""

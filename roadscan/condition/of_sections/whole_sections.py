@@ -8,10 +8,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64
 from roadscan.condition.lane_data import CrossSections, LaneData
-
-Float64 = npt.NDArray[np.float64]
-Bool = npt.NDArray[np.bool_]
 
 _NOISIER: Final = 10.0
 """Factor on the lane's σ that shows readings of another kind of sensor; within one kind σ varies two- or threefold."""

@@ -7,14 +7,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.compute.edges.painted_line import painted_line, without_lines
 from roadscan.condition.kernels.intensity_means import mean_intensities
 from roadscan.condition.kernels.sampling import CellTable
 from roadscan.condition.road_line import Lane, RoadLine
-
-Float64 = npt.NDArray[np.float64]
 
 SPACING_M: Final = 0.5
 """Distance between the places along the lane at which lines are sought; intensities are means over it."""

@@ -9,15 +9,12 @@ from types import MappingProxyType
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import scipy.ndimage
 import shapely
 
+from roadscan.compute.array_types import Bool, Float64
 from roadscan.compute.robust import SIGMA_OF_MAD, scatter_about
 from roadscan.condition.on_lane.squares import SQUARE_M, TextureSquares
-
-Float64 = npt.NDArray[np.float64]
-Bool = npt.NDArray[np.bool_]
 
 LEAST_RATIO: Final = 1.15
 """Least ratio of a square's texture to its section's; it also exceeds it by :data:`_SIGMAS` of the section's spread."""

@@ -6,8 +6,8 @@ from dataclasses import dataclass, fields, replace
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.kernels.lane_texture import (
     FIGURES,
     INTENSITY,
@@ -22,8 +22,6 @@ from roadscan.condition.kernels.lane_texture import (
 )
 from roadscan.condition.kernels.sampling import CellTable
 from roadscan.condition.road_line import Lane, RoadLine
-
-Float64 = npt.NDArray[np.float64]
 
 SQUARE_M: Final = 0.2
 """Edge of a square (m): two segments of a texture profile."""

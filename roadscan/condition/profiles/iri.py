@@ -13,11 +13,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.profiles.profiles import heights_of
 from roadscan.condition.profiles.ride import Ride, ride
 from roadscan.condition.profiles.segments import Segments
-
-Floats = npt.NDArray[np.float64]
 
 LOCAL_M = 7.62
 """Length of the rolling mean that shows localised roughness (25 feet; m)."""
@@ -26,9 +25,9 @@ LOCAL_M = 7.62
 class SegmentIri(NamedTuple):
     """IRI of segments, of several profiles."""
 
-    iri_m_per_km: Floats
+    iri_m_per_km: Float64
     """(profiles, segments); NaN where less than half of a segment was measured."""
-    measured_share: Floats
+    measured_share: Float64
     """(profiles, segments) share of the segment that was measured."""
 
 
@@ -38,7 +37,7 @@ def iri_of(on: Ride, segments: Segments) -> SegmentIri:
     return SegmentIri(1e3 * means, shares)
 
 
-def rolling_iri(on: Ride, length_m: float = LOCAL_M) -> Floats:
+def rolling_iri(on: Ride, length_m: float = LOCAL_M) -> Float64:
     """Return the IRI over `length_m` around each sample (profiles, n); NaN within half of it of the ends.
 
     The continuous report of localised roughness, as AASHTO R 54 has it with 7.62 m (public descriptions).
@@ -51,7 +50,7 @@ def rolling_iri(on: Ride, length_m: float = LOCAL_M) -> Floats:
     return found
 
 
-def mean_roughness_index(iri_left_m_per_km: Floats, iri_right_m_per_km: Floats) -> Floats:
+def mean_roughness_index(iri_left_m_per_km: Float64, iri_right_m_per_km: Float64) -> Float64:
     """Return the MRI (m/km): the mean of the IRI of two wheel paths (AASHTO R 43, public descriptions)."""
     return 0.5 * (iri_left_m_per_km + iri_right_m_per_km)
 

@@ -5,13 +5,10 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64
 from roadscan.compute.robust import scatter_about
 from roadscan.core.witness import Finding, Witness
-
-Floats = npt.NDArray[np.float64]
-Bool = npt.NDArray[np.bool_]
 
 PROFILE_SAMPLES: Final = Witness(
     name="profile_samples",
@@ -59,7 +56,7 @@ NOTABLE: Final = 0.05
 class SoundHeights(NamedTuple):
     """Heights of a profile without samples that are not road."""
 
-    height_m: Floats
+    height_m: Float64
     """(n,) heights; NaN where nothing was measured or a sample is left out."""
     stuck: Bool
     """(n,) True for samples that repeat a height."""
@@ -68,7 +65,7 @@ class SoundHeights(NamedTuple):
     step_m: float
     """Step to which the heights are rounded; 0 where they are not."""
 
-    def rounded_again(self) -> Floats:
+    def rounded_again(self) -> Float64:
         """Return (2, n) heights with simulated errors of as much rounding, within half a step up and down (m).
 
         In the first, errors of samples are independent, as where a road changes by more than a step a sample; in the
@@ -78,7 +75,7 @@ class SoundHeights(NamedTuple):
         drawn = self.step_m * np.random.default_rng(1).uniform(-0.5, 0.5, shared.size)
         return np.asarray(self.height_m + np.stack([drawn, drawn[shared]]), np.float64)
 
-    def findings(self, x_m: Floats, whose: str) -> list[Finding]:
+    def findings(self, x_m: Float64, whose: str) -> list[Finding]:
         """Return what was left out; `x_m` (n,) stations (m), `whose` names the profile."""
         found = []
         if self.stuck.any():
@@ -96,7 +93,7 @@ class SoundHeights(NamedTuple):
         return [PROFILE_SAMPLES.finds(whose, f"{text}. They are left out.", count) for text, count in found]
 
 
-def sound_heights(x_m: Floats, height_m: Floats, *, spikes: bool = True) -> SoundHeights:
+def sound_heights(x_m: Float64, height_m: Float64, *, spikes: bool = True) -> SoundHeights:
     """Return heights of a profile without repeated ones and without spikes.
 
     A height counts as repeated where a run of samples has it, and heights elsewhere change by ten steps over a third of
@@ -120,7 +117,7 @@ def sound_heights(x_m: Floats, height_m: Floats, *, spikes: bool = True) -> Soun
     return SoundHeights(np.where(stuck | spike, np.nan, height_m), stuck, spike, told_m)
 
 
-def too_high_by(index: Floats, again: Floats) -> Floats:
+def too_high_by(index: Float64, again: Float64) -> Float64:
     """Return the excess of an index (segments,) due to rounding, from that of heights rounded again (2, segments).
 
     Errors of rounding are not those of the road, so that their squares add up; of the two ways to err, the worse one.
@@ -128,7 +125,7 @@ def too_high_by(index: Floats, again: Floats) -> Floats:
     return np.asarray(index - np.sqrt(np.maximum(2.0 * index**2 - np.max(again, axis=0) ** 2, 0.0)))
 
 
-def _step(h: Floats) -> float:
+def _step(h: Float64) -> float:
     """Return the step on which all heights lie; 0 for none."""
     values = np.unique(np.round(h, 9))
     if values.size < 3:
@@ -140,13 +137,13 @@ def _step(h: Floats) -> float:
     return step if bool((np.abs(off - np.rint(off)) < _ON_STEP).all()) else 0.0
 
 
-def _jumps_about(h: Floats, step_m: float) -> bool:
+def _jumps_about(h: Float64, step_m: float) -> bool:
     """Return whether heights jump between steps as rounded ones do; drawn lines have steps by themselves."""
     bend = np.abs(h[2:] - 2.0 * h[1:-1] + h[:-2])
     return int(np.count_nonzero(bend > 0.5 * step_m)) >= _BENDS
 
 
-def _repeated(h: Floats, step_m: float) -> Bool:
+def _repeated(h: Float64, step_m: float) -> Bool:
     """Return samples after the first of a run of equal heights that is too long for this road."""
     from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
@@ -168,7 +165,7 @@ def _repeated(h: Floats, step_m: float) -> Bool:
     return out if _is_measured(h[~out], count // 2, step_m) else np.zeros(h.size, np.bool_)
 
 
-def _is_measured(h: Floats, lag: int, step_m: float) -> bool:
+def _is_measured(h: Float64, lag: int, step_m: float) -> bool:
     """Return whether heights bend in most places, as those of a road do."""
     if h.size < max(_LEAST_OTHERS, 2 * lag + 1):
         return False
@@ -176,7 +173,7 @@ def _is_measured(h: Floats, lag: int, step_m: float) -> bool:
     return bool(np.mean(bend > max(0.5 * step_m, 1e-9)) > 0.5)
 
 
-def _alone(x_m: Floats, h: Floats) -> Bool:
+def _alone(x_m: Float64, h: Float64) -> Bool:
     """Return samples that are spikes: higher or lower than both neighbours."""
     if h.size < _LEAST_OTHERS:
         return np.zeros(h.size, np.bool_)

@@ -9,12 +9,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.profiles.profiles import heights_of, stations_of
 from roadscan.core.errors import FormatError, ProfileError, RoadscanError, in_words
 from roadscan.store.codecs.erd import erd_text, is_erd, parse_erd
 from roadscan.store.codecs.profile_text import parse_columns
-
-Floats = npt.NDArray[np.float64]
 
 UNITS_M = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3, "ft": 0.3048, "in": 0.0254, "mil": 2.54e-5}
 """Units of stations and heights, in metres."""
@@ -28,9 +27,9 @@ _EVEN_M = 1e-6
 class ProfileFile:
     """Profiles of a file that share their stations."""
 
-    x_m: Floats
+    x_m: Float64
     """(n,) stations (m)."""
-    height_m: Floats
+    height_m: Float64
     """(profiles, n) heights, NaN where there is none (m)."""
     names: tuple[str, ...]
     """Names of the profiles in the file."""
@@ -126,7 +125,7 @@ def _of_erd(text: str, stated: StatedUnits) -> ProfileFile:
     chosen = _chosen(stated.columns, read.names) if stated.columns else range(len(read.names))
     scale_x = _scale(read.x_unit, stated.x, "--x-unit", "stations")
     scale = [_scale(read.units[k], stated.height, "--height-unit", f"channel {read.names[k]}") for k in chosen]
-    x: Floats = np.asarray(scale_x * (read.start + read.step * np.arange(read.values.shape[1])), np.float64)
+    x: Float64 = np.asarray(scale_x * (read.start + read.step * np.arange(read.values.shape[1])), np.float64)
     heights = np.stack([size * read.values[k] for size, k in zip(scale, chosen, strict=True)])
     return ProfileFile(x, heights, tuple(read.names[k] for k in chosen), ())
 
@@ -151,7 +150,7 @@ def _of_text(text: str, stated: StatedUnits) -> ProfileFile:
     return ProfileFile(x, np.stack(heights), tuple(read.names[k] for k in others), read.rejects)
 
 
-def _check_order(x: Floats, records: npt.NDArray[np.int64]) -> None:
+def _check_order(x: Float64, records: npt.NDArray[np.int64]) -> None:
     wrong = np.flatnonzero(~(np.diff(x) > 0.0))
     if wrong.size:
         k = int(wrong[0])

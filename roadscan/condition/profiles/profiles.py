@@ -7,11 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.kernels.quarter_car import Rules
 from roadscan.condition.profiles.quarter_car import COARSEST_M, SEVERE_M
 from roadscan.core.errors import ProfileError
-
-Floats = npt.NDArray[np.float64]
 
 STEEPEST = 0.3
 """Largest slope over 250 mm of a road in half of its places (a ratio)."""
@@ -24,19 +23,19 @@ FINEST_CLASS_M = 0.25
 class Breaks(NamedTuple):
     """Gaps and jumps of a profile (m along it)."""
 
-    gap_from_m: Floats
+    gap_from_m: Float64
     """Last samples before gaps."""
-    gap_to_m: Floats
+    gap_to_m: Float64
     """First samples behind them."""
-    jump_m: Floats
+    jump_m: Float64
     """Middles of steps that are too high: nothing rolls over them."""
-    severe_m: Floats
+    severe_m: Float64
     """Middles of steps that are high and kept, as those of kerbs."""
-    wide_m: Floats
+    wide_m: Float64
     """Middles of steps of more than 0.25 m between samples that are no gap."""
 
 
-def stations_of(x_m: npt.ArrayLike) -> Floats:
+def stations_of(x_m: npt.ArrayLike) -> Float64:
     """Return stations (n,) of a profile, ascending (m).
 
     Raises
@@ -62,7 +61,7 @@ def stations_of(x_m: npt.ArrayLike) -> Floats:
     return x
 
 
-def heights_of(height_m: npt.ArrayLike, samples: int) -> Floats:
+def heights_of(height_m: npt.ArrayLike, samples: int) -> Float64:
     """Return heights (profiles, samples), also for one profile (m).
 
     Raises
@@ -78,7 +77,7 @@ def heights_of(height_m: npt.ArrayLike, samples: int) -> Floats:
     return heights
 
 
-def breaks_of(x_m: Floats, height_m: Floats, rules: Rules) -> Breaks:
+def breaks_of(x_m: Float64, height_m: Float64, rules: Rules) -> Breaks:
     """Return gaps and jumps of a profile; `x_m`, `height_m` (n,), NaN where there is no height."""
     there = np.isfinite(height_m)
     xs, hs = x_m[there], height_m[there]
@@ -91,7 +90,7 @@ def breaks_of(x_m: Floats, height_m: Floats, rules: Rules) -> Breaks:
     return Breaks(xs[:-1][gap], xs[1:][gap], middle[jump], middle[severe], middle[wide])
 
 
-def fault_of(x_m: Floats, height_m: Floats, rules: Rules) -> str:
+def fault_of(x_m: Float64, height_m: Float64, rules: Rules) -> str:
     """Why a profile can have no index, or an empty text; `x_m`, `height_m` (n,), NaN where there is no height."""
     there = np.isfinite(height_m)
     xs, hs = x_m[there], height_m[there]

@@ -14,11 +14,9 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.kernels.quarter_car import QuarterCar, Rules
-
-Floats = npt.NDArray[np.float64]
 
 SPEED_M_PER_S = 80.0 / 3.6
 """Speed of all ride indices: 80 km/h."""
@@ -40,7 +38,7 @@ _EVEN_SHARE: Final = 0.9
 """Least share of steps of the usual length where spacing is even: lost samples leave some longer ones."""
 
 
-def usual_step_m(x_m: Floats) -> float:
+def usual_step_m(x_m: Float64) -> float:
     """Return the usual distance between stations (m), or NaN where they are not evenly spaced."""
     step = np.diff(x_m)
     usual = float(np.median(step))

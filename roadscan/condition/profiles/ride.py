@@ -8,12 +8,12 @@ from typing import Final, Literal, TypeAlias, get_args
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.kernels.quarter_car import QuarterCar, roll
 from roadscan.condition.profiles.profiles import Breaks, breaks_of, fault_of, heights_of, stations_of
 from roadscan.condition.profiles.quarter_car import COARSEST_M, GOLDEN_CAR, RULES, rules_at, usual_step_m
 from roadscan.condition.profiles.segments import Segments
 
-Floats = npt.NDArray[np.float64]
 Note: TypeAlias = Literal["start", "gap", "jump", "step", "uneven", "short"]
 NOTES: Final[tuple[Note, ...]] = get_args(Note)
 """Possible words of a segment's note, in their order."""
@@ -23,11 +23,11 @@ NOTES: Final[tuple[Note, ...]] = get_args(Note)
 class Ride:
     """Response of a quarter car to profiles that share their stations."""
 
-    x_m: Floats
+    x_m: Float64
     """(n,) stations (m)."""
-    response_m: Floats
+    response_m: Float64
     """(profiles, n) integral of the suspension's |slope|, or of its square, from the first sample on (m)."""
-    measured_m: Floats
+    measured_m: Float64
     """(profiles, n) length rolled over from the first sample on (m); gaps do not count."""
     breaks: tuple[Breaks, ...]
     """Gaps and jumps of each profile."""
@@ -36,7 +36,7 @@ class Ride:
     even: bool
     """Whether its stations are evenly spaced, as ASTM E1926 takes them."""
 
-    def means(self, segments: Segments, least_share: float = 0.5) -> tuple[Floats, Floats]:
+    def means(self, segments: Segments, least_share: float = 0.5) -> tuple[Float64, Float64]:
         """Return means of the response over segments, and the share of each segment that was rolled over.
 
         Returns
@@ -74,7 +74,7 @@ class Ride:
         first, behind = (np.searchsorted(wide, ends) for ends in segments)
         return np.where(behind > first, 2, 1)
 
-    def _over(self, sums: Floats, segments: Segments) -> Floats:
+    def _over(self, sums: Float64, segments: Segments) -> Float64:
         """Return differences of sums over segments."""
         return np.interp(segments.to_m, self.x_m, sums) - np.interp(segments.from_m, self.x_m, sums)
 

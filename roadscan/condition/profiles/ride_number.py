@@ -14,11 +14,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.profiles.quarter_car import quarter_car
 from roadscan.condition.profiles.ride import Ride, ride
 from roadscan.condition.profiles.segments import Segments
-
-Floats = npt.NDArray[np.float64]
 
 RIDE_NUMBER_CAR = quarter_car(k1=5120.0, k2=390.0, c=17.0, mu=0.036)
 """The car of the ride number."""
@@ -27,11 +26,11 @@ RIDE_NUMBER_CAR = quarter_car(k1=5120.0, k2=390.0, c=17.0, mu=0.036)
 class RideNumber(NamedTuple):
     """Ride numbers of segments."""
 
-    ride_number: Floats
+    ride_number: Float64
     """(segments,) from 0 to 5; NaN where less than half of a segment was measured."""
-    profile_index: Floats
+    profile_index: Float64
     """(profiles, segments) PI, a slope."""
-    measured_share: Floats
+    measured_share: Float64
     """(profiles, segments) share of the segment that was measured."""
 
 
@@ -46,7 +45,7 @@ def ride_number_of(on: Ride, segments: Segments) -> RideNumber:
     return RideNumber(ride_number(np.sqrt(squares)), np.sqrt(squares), shares)
 
 
-def ride_number(profile_index: Floats) -> Floats:
+def ride_number(profile_index: Float64) -> Float64:
     """Return the ride number (k,) of wheel paths together, from their profile indices (paths, k)."""
-    rating: Floats = 5.0 * np.exp(-160.0 * np.sqrt(np.mean(profile_index**2, axis=0)))
+    rating: Float64 = 5.0 * np.exp(-160.0 * np.sqrt(np.mean(profile_index**2, axis=0)))
     return rating

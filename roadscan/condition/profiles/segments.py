@@ -6,19 +6,17 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import ProfileError
-
-Floats = npt.NDArray[np.float64]
 
 
 class Segments(NamedTuple):
     """Beginnings and ends of segments."""
 
-    from_m: Floats
+    from_m: Float64
     """(segments,) station of the beginning (m)."""
-    to_m: Floats
+    to_m: Float64
     """(segments,) station of the end (m)."""
 
 
@@ -40,7 +38,7 @@ def segments_of(
     if length_m is not None and stations_m is not None:
         raise ProfileError("a length of segments and fixed stations", expected="one of them")
     if stations_m is not None:
-        ends: Floats = np.unique(np.asarray(stations_m, np.float64))
+        ends: Float64 = np.unique(np.asarray(stations_m, np.float64))
         if not np.isfinite(ends).all():
             raise ProfileError(f"a station {ends[~np.isfinite(ends)][0]}", expected="finite numbers, in metres")
         inside = (ends[1:] > first_m) & (ends[:-1] < last_m) if ends.size > 1 else np.zeros(0, bool)

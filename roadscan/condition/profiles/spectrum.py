@@ -15,11 +15,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.profiles.profiles import heights_of, raise_fault, stations_of
 from roadscan.condition.profiles.quarter_car import COARSEST_M, RULES
 from roadscan.core.errors import ProfileError
-
-Floats = npt.NDArray[np.float64]
 
 REFERENCE_PER_M = 0.1
 """Spatial frequency n0 at which C is defined (cycles a metre)."""
@@ -38,9 +37,9 @@ THINNEST_BANDS = 5
 class RoadSpectrum(NamedTuple):
     """One-sided spectrum of a profile, and the fit to it."""
 
-    frequency_per_m: Floats
+    frequency_per_m: Float64
     """(k,) spatial frequencies, without 0 (cycles a metre)."""
-    density_m3: Floats
+    density_m3: Float64
     """(k,) displacement power spectral density (m³)."""
     roughness_m3: float
     """C: the fitted density at 0.1 cycles a metre (m³)."""
@@ -90,7 +89,7 @@ def road_spectrum(x_m: npt.ArrayLike, height_m: npt.ArrayLike, window_m: float =
     length = min(window_m, longest)
     samples = int(length / step + 1e-6)
     total, weight = np.zeros(samples // 2 + 1), 0.0
-    frequency: Floats = np.asarray(np.fft.rfftfreq(samples, step), np.float64)
+    frequency: Float64 = np.asarray(np.fft.rfftfreq(samples, step), np.float64)
     for xs, hs in pieces:
         even = np.arange(xs[0], xs[-1] + 1e-9, step)
         if even.size >= samples:
@@ -109,7 +108,7 @@ def road_class(roughness_m3: float) -> str:
     return "ABCDEFGH"[int(np.searchsorted(CLASS_LIMITS_M3, roughness_m3))]
 
 
-def _pieces(x: Floats, height: Floats) -> list[tuple[Floats, Floats]]:
+def _pieces(x: Float64, height: Float64) -> list[tuple[Float64, Float64]]:
     """Return stations and heights between gaps and jumps."""
     there = np.isfinite(height)
     xs, hs = x[there], height[there]
@@ -118,7 +117,7 @@ def _pieces(x: Floats, height: Floats) -> list[tuple[Floats, Floats]]:
     return [(xs[a:b], hs[a:b]) for a, b in pairwise(ends) if b - a > 1]
 
 
-def _fitted(frequency: Floats, density: Floats) -> tuple[tuple[float, float, float, float], tuple[float, float]]:
+def _fitted(frequency: Float64, density: Float64) -> tuple[tuple[float, float, float, float], tuple[float, float]]:
     """Fit C and w to means over thirds of an octave; return them with standard deviations, and the range of the fit."""
     inside = (frequency >= FIT_PER_M[0]) & (frequency <= FIT_PER_M[1]) & (density > 0.0)
     n, g = frequency[inside], density[inside]

@@ -10,12 +10,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.condition.kernels.straightedge import roll_beam, roll_wheel
+from roadscan.compute.array_types import Float64
+from roadscan.condition.kernels.steps import roll_beam, roll_wheel
 from roadscan.condition.profiles.profiles import heights_of, stations_of
 from roadscan.condition.profiles.quarter_car import COARSEST_M
 from roadscan.core.errors import ProfileError
-
-Floats = npt.NDArray[np.float64]
 
 LENGTHS_M = {"3 m": 3.0, "10 ft": 3.048, "16 ft": 4.8768}
 """Usual lengths of beams (m)."""
@@ -23,7 +22,7 @@ LENGTHS_M = {"3 m": 3.0, "10 ft": 3.048, "16 ft": 4.8768}
 
 def straightedge_mm(
     x_m: npt.ArrayLike, height_m: npt.ArrayLike, length_m: float = 3.0, *, wheel_radius_m: float = 0.0
-) -> Floats:
+) -> Float64:
     """Return the deviation (n,) of a rolling straightedge's middle at each sample, positive over a bump (mm).
 
     NaN where the beam reaches beyond the profile, stands over a gap of more than a foot, or has no height under its

@@ -1,29 +1,35 @@
-"""Indices of profiles as tables, for Python and the command line."""
+"""Indices of profiles as tables, for Python and the command line.
+
+Mean profile depth of texture profiles, after the steps of ISO 13473-1:2019.
+
+The depth of a segment of 100 mm is the mean of the peaks of its two halves above its mean; MPD is the mean of the
+depths of valid segments. How a profile is made ready, and what that was taken from, stands in
+:mod:`roadscan.condition.profiles.texture`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
+from roadscan.compute.flags import runs_of
 from roadscan.condition.profiles.iri import LOCAL_M, half_car_ride, iri_of, mean_roughness_index, rolling_iri
-from roadscan.condition.profiles.mpd import mean_profile_depths
 from roadscan.condition.profiles.profile_faults import NOTABLE, PROFILE_STEPS, SoundHeights, sound_heights, too_high_by
 from roadscan.condition.profiles.profiles import heights_of, raise_fault, stations_of
 from roadscan.condition.profiles.ride import NOTES, Ride, ride
 from roadscan.condition.profiles.ride_number import ride_number_of, ride_number_ride
 from roadscan.condition.profiles.segments import Segments, segments_of
-from roadscan.condition.profiles.texture import TextureSettings, rms_texture_mm, texture_segments
-from roadscan.condition.stretches import stretches_above
+from roadscan.condition.profiles.texture import TextureSegment, TextureSettings, rms_texture_mm, texture_segments
 from roadscan.core.errors import ProfileError
 from roadscan.core.witness import Finding
 
 if TYPE_CHECKING:
     import pandas as pd
 
-Floats = npt.NDArray[np.float64]
 
 FLATTEST_M_PER_KM = 0.1
 """Least IRI of a road: a lower one was measured in another unit, or is no road."""
@@ -230,14 +236,14 @@ def _sound_ride(x_m: npt.ArrayLike, height_m: npt.ArrayLike) -> tuple[Ride, list
     return on, heights
 
 
-def _rounding(x: Floats, sound: SoundHeights, parts: Segments, found: Floats) -> Floats:
+def _rounding(x: Float64, sound: SoundHeights, parts: Segments, found: Float64) -> Float64:
     """Return the part of the IRI of segments (m/km) that is due to rounding."""
     if sound.step_m < FINEST_STEP_M:
         return np.zeros_like(found)
     return too_high_by(found, iri_of(ride(x, sound.rounded_again()), parts).iri_m_per_km)
 
 
-def _left_out(x: Floats, sound: Sequence[SoundHeights], parts: Segments, k: int) -> list[str]:
+def _left_out(x: Float64, sound: Sequence[SoundHeights], parts: Segments, k: int) -> list[str]:
     """Return words for the samples of a segment that were left out."""
     inside = (x >= parts.from_m[k]) & (x <= parts.to_m[k])
     told = {"stuck": [one.stuck for one in sound], "spikes": [one.spike for one in sound]}
@@ -248,12 +254,12 @@ def _whose(names: Sequence[str]) -> list[str]:
     return [f"profile {name}" for name in names] if len(names) > 1 else [""]
 
 
-def _findings(x: Floats, sound: Sequence[SoundHeights], names: Sequence[str]) -> list[Finding]:
+def _findings(x: Float64, sound: Sequence[SoundHeights], names: Sequence[str]) -> list[Finding]:
     of_each = (one.findings(x, whose) for one, whose in zip(sound, _whose(names), strict=True))
     return [finding for own in of_each for finding in own]
 
 
-def _joined(on: Ride, parts: Segments, segment_m: float | None, found: Floats) -> list[str]:
+def _joined(on: Ride, parts: Segments, segment_m: float | None, found: Float64) -> list[str]:
     """Join the notes of all profiles, each word once."""
     of_all = on.notes(parts, segment_m)
     flat = np.atleast_1d((found < FLATTEST_M_PER_KM).any(axis=0))
@@ -263,3 +269,67 @@ def _joined(on: Ride, parts: Segments, segment_m: float | None, found: Floats) -
         words = [word for word in NOTES if any(word in notes[k] for notes in of_all)]
         joined.append(", ".join(words + ["flat"] * bool(flat[k]) + ["wild"] * bool(wild[k])))
     return joined
+
+
+class MeanProfileDepth(NamedTuple):
+    """MPD of a stretch."""
+
+    mpd_mm: float
+    """Mean depth of its valid segments (mm); NaN where fewer than half are valid."""
+    stdev_mm: float
+    """Standard deviation of the depths (mm, n − 1); NaN of fewer than two."""
+    valid: int
+    """Number of valid segments."""
+    segments: int
+    """Number of segments that begin in the stretch."""
+
+
+def segment_depth_mm(height_mm: Float64) -> float:
+    """Return the depth (mm) of a segment from its heights (n,): mean of both halves' peaks above the mean of all."""
+    middle = height_mm.size // 2
+    return float(0.5 * (height_mm[:middle].max() + height_mm[middle:].max()) - height_mm.mean())
+
+
+def mean_profile_depth(segments: Sequence[TextureSegment]) -> MeanProfileDepth:
+    """Return the MPD of segments taken together."""
+    depths = np.array([segment_depth_mm(one.height_mm) for one in segments if not one.note])
+    enough = depths.size > 0 and 2 * depths.size >= len(segments)
+    return MeanProfileDepth(
+        float(depths.mean()) if enough else np.nan,
+        float(depths.std(ddof=1)) if enough and depths.size > 1 else np.nan,
+        depths.size,
+        len(segments),
+    )
+
+
+def mean_profile_depths(segments: Sequence[TextureSegment], stretches: Segments) -> list[MeanProfileDepth]:
+    """Return the MPD of each stretch, from the segments that begin in it."""
+    begin = np.array([one.from_m for one in segments])
+    found = []
+    for first, last in zip(stretches.from_m, stretches.to_m, strict=True):
+        # A segment of 100 mm that begins on a border, up to rounding, begins behind it.
+        inside = np.flatnonzero((begin >= first - 1e-6) & (begin < last - 1e-6)).tolist()
+        found.append(mean_profile_depth([segments[k] for k in inside]))
+    return found
+
+
+class Stretch(NamedTuple):
+    """A stretch where a quantity stays above a limit."""
+
+    from_m: float
+    """Station of its first sample (m)."""
+    to_m: float
+    """Station of its last sample (m)."""
+    peak_m: float
+    """Station of the greatest value (m)."""
+    peak: float
+    """The greatest value, in the unit of the quantity."""
+
+
+def stretches_above(x_m: Float64, values: Float64, limit: float) -> list[Stretch]:
+    """Return stretches where values (n,) at stations (n,) are above a limit, in order; NaN is not above it."""
+    found = []
+    for first, behind in runs_of(values > limit).tolist():
+        peak = first + int(np.argmax(values[first:behind]))
+        found.append(Stretch(float(x_m[first]), float(x_m[behind - 1]), float(x_m[peak]), float(values[peak])))
+    return found

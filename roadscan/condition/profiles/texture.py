@@ -15,13 +15,12 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
+from roadscan.compute.array_types import Float64
 from roadscan.compute.flags import runs_of
 from roadscan.compute.robust import SIGMA_OF_MAD
 from roadscan.condition.profiles.profiles import heights_of, stations_of
 from roadscan.core.errors import ProfileError
 from roadscan.core.strict import Strict
-
-Floats = npt.NDArray[np.float64]
 
 SEGMENT_MM = 100.0
 """Length of a segment (mm)."""
@@ -59,7 +58,7 @@ class TextureSegment(NamedTuple):
     """Its beginning (m)."""
     to_m: float
     """Its end (m)."""
-    height_mm: Floats
+    height_mm: Float64
     """(n,) heights above the best straight line (mm)."""
     dropout_share: float
     """Share of it without a reading."""
@@ -135,7 +134,7 @@ def texture_segments(
     return found
 
 
-def _check(along_mm: Floats, height_mm: Floats, settings: TextureSettings) -> None:
+def _check(along_mm: Float64, height_mm: Float64, settings: TextureSettings) -> None:
     there = np.isfinite(height_mm)
     if there.sum() < 2:
         raise ProfileError(f"{there.sum()} of {height_mm.size} samples have a height", expected="a texture profile")
@@ -158,7 +157,7 @@ def _check(along_mm: Floats, height_mm: Floats, settings: TextureSettings) -> No
         )
 
 
-def _bridged(place_mm: Floats, height_mm: Floats) -> Floats:
+def _bridged(place_mm: Float64, height_mm: Float64) -> Float64:
     """Fill dropouts linearly; beyond the first and last reading with these."""
     there = np.isfinite(height_mm)
     if there.all():
@@ -168,19 +167,19 @@ def _bridged(place_mm: Floats, height_mm: Floats) -> Floats:
     return np.asarray(np.interp(place_mm, place_mm[there], height_mm[there]), np.float64)
 
 
-def _resample(along_mm: Floats, height_mm: Floats, step_mm: float) -> tuple[Floats, Floats, npt.NDArray[np.bool_]]:
+def _resample(along_mm: Float64, height_mm: Float64, step_mm: float) -> tuple[Float64, Float64, npt.NDArray[np.bool_]]:
     """Return means over (k·step, (k+1)·step], placed at its end; and whether any sample lies there, else bridged."""
     # A sample on a border is assigned by its binary value, as in captif-slp: 1e-5 mm of MPD depend on it.
     last = np.maximum(np.ceil(along_mm / step_mm), 1.0).astype(np.int64)
     count = np.bincount(last)[1:]
     total = np.bincount(last, weights=height_mm)[1:]
-    place_mm: Floats = np.asarray(step_mm * np.arange(1, count.size + 1), np.float64)
+    place_mm: Float64 = np.asarray(step_mm * np.arange(1, count.size + 1), np.float64)
     mean = np.full(count.size, np.nan)
     mean[count > 0] = total[count > 0] / count[count > 0]
     return place_mm, _bridged(place_mm, mean), count > 0
 
 
-def _spikes(height_mm: Floats, settings: TextureSettings) -> npt.NDArray[np.bool_]:
+def _spikes(height_mm: Float64, settings: TextureSettings) -> npt.NDArray[np.bool_]:
     """Return samples on both sides of a step that is too steep."""
     steep = np.abs(np.diff(height_mm)) >= settings.spike_ratio * settings.resampled_mm
     spike = np.zeros(height_mm.size, np.bool_)
@@ -189,7 +188,7 @@ def _spikes(height_mm: Floats, settings: TextureSettings) -> npt.NDArray[np.bool
     return spike
 
 
-def _jumps(height_mm: Floats, settings: TextureSettings) -> npt.NDArray[np.bool_]:
+def _jumps(height_mm: Float64, settings: TextureSettings) -> npt.NDArray[np.bool_]:
     """Return samples at which the profile steps to another level.
 
     The medians of the heights on both sides are compared. Their differences scatter by the texture; a step is one that
@@ -202,7 +201,7 @@ def _jumps(height_mm: Floats, settings: TextureSettings) -> npt.NDArray[np.bool_
     if samples <= 2 * size:
         return jump
 
-    def rises(smooth_mm: Floats) -> Floats:
+    def rises(smooth_mm: Float64) -> Float64:
         """Return differences between the stretch from a sample on and the stretch that ends before it."""
         middle = size // 2
         behind, before = smooth_mm[size + middle :], smooth_mm[middle:]
@@ -219,7 +218,7 @@ def _jumps(height_mm: Floats, settings: TextureSettings) -> npt.NDArray[np.bool_
     return jump
 
 
-def _low_passed(height_mm: Floats, settings: TextureSettings) -> Floats:
+def _low_passed(height_mm: Float64, settings: TextureSettings) -> Float64:
     from scipy.signal import butter, sosfiltfilt
 
     cut_off = 2.0 * settings.resampled_mm / settings.shortest_wave_mm
@@ -228,12 +227,12 @@ def _low_passed(height_mm: Floats, settings: TextureSettings) -> Floats:
     return np.asarray(sosfiltfilt(butter(2, cut_off, output="sos"), height_mm), np.float64)
 
 
-def _segment_of(place_mm: Floats) -> npt.NDArray[np.int64]:
+def _segment_of(place_mm: Float64) -> npt.NDArray[np.int64]:
     """Return the number of each place's segment; a place on a border belongs to the segment before it."""
     return np.asarray(np.maximum(np.ceil(np.round(place_mm / SEGMENT_MM, 9)) - 1, 0), np.int64)
 
 
-def segment_rms_mm(height_mm: Floats) -> float:
+def segment_rms_mm(height_mm: Float64) -> float:
     """Return the root mean square (mm) of the heights (n,) of a segment whose slope was removed."""
     return float(np.sqrt(np.mean(np.square(height_mm))))
 

@@ -17,13 +17,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64
 from roadscan.compute.edges.across import DEFAULT, AcrossSettings, counted, evidence_across, path_along
 from roadscan.compute.edges.painted_line import PAINT, without_lines
 from roadscan.compute.robust import SIGMA_OF_MAD
 from roadscan.condition.road_edges.raster import OFFSET_M, STATION_M, SideRaster
-
-Float64 = npt.NDArray[np.float64]
-Bool = npt.NDArray[np.bool_]
 
 KINDS: Final = ("kerb", "drop", "slope", "intensity", "marking", "polygon")
 """Evidence of an edge: a step up, a step down, a change of slope, one of intensity, a painted line, a polygon."""

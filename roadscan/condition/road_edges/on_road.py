@@ -11,12 +11,11 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
+from roadscan.compute.array_types import Float64
 from roadscan.compute.flags import runs_of
 from roadscan.condition.road_edges.find import INNER_M, KINDS, SideEdge, drops, find_edge, first_m
 from roadscan.condition.road_edges.raster import OFFSET_M, STATION_M, TilePoints, ground_points, side_raster
 from roadscan.condition.road_line import Lane, RoadLine
-
-Float64 = npt.NDArray[np.float64]
 
 SIDES: Final = {"left": -1.0, "right": 1.0}
 """Sides of the reference line, with the sign of offsets there."""

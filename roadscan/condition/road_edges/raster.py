@@ -9,10 +9,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.road_line import RoadLine
 from roadscan.tiles.cells import TileCells
-
-Float64 = npt.NDArray[np.float64]
 
 STATION_M: Final = 0.5  # Extent of a cell along the road.
 OFFSET_M: Final = 0.1

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 _STEEPEST_RAD: Final = np.radians(80.0)
 """Largest angle of incidence that is corrected: beyond it, the cosine is constant, lest glancing returns dominate."""

@@ -8,11 +8,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.natural_neighbour import interpolate
 from roadscan.condition.roughness_regions.points import RoadPoints
 from roadscan.core.extras import cv2
-
-Float64 = npt.NDArray[np.float64]
 
 _BRIGHTEST: Final = 255  # Largest 8-bit value.
 

@@ -14,23 +14,63 @@ against the surface of the road around it.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import shapely
 
-from roadscan.condition.roughness_regions.clusters import Cluster, clusters_of
+from roadscan.compute.array_types import Float64
+from roadscan.compute.robust import scatter_about
 from roadscan.condition.roughness_regions.intensity import three_classes
 from roadscan.condition.roughness_regions.points import RoadPoints, pyramid, rotated_back
 from roadscan.condition.roughness_regions.raster import IntensityRaster, closed, intensity_raster
 from roadscan.condition.roughness_regions.settings import RoughnessRegionsConfig
-from roadscan.condition.roughness_regions.severity import UNKNOWN, Severity, severity
-from roadscan.condition.roughness_regions.surface import RoadSurface, road_below
+from roadscan.condition.roughness_regions.surface import RoadSurface, fit, road_below
 from roadscan.core.extras import cv2
 
-Float64 = npt.NDArray[np.float64]
+
+class Severity(NamedTuple):
+    """Measures of a region; NaN where the road around was not measured."""
+
+    contrast: float
+    """Share by which its median intensity is lower than that of the road around."""
+    intensity: float
+    """Median intensity of its points."""
+    residual_mean_m: float
+    """Mean height above the surface of the road around: negative where it has sunk."""
+    residual_sigma_m: float
+    """Standard deviation of these heights: the roughness (Kumar et al. 2015)."""
+    around_sigma_m: float
+    """The same for the road around, by the median of its absolute residuals: noise and texture."""
+
+
+UNKNOWN: Final = Severity(*5 * (float("nan"),))  # Nothing was measured around it.
+
+
+def severity(own: RoadPoints, around: RoadPoints) -> Severity:
+    """Compute measures of a region's points relative to those of the road around it.
+
+    The surface is one of the second degree, by a robust fit (Tukey's biweight) to the road around: Kumar et al. (2015)
+    fit a grid of the points themselves, which follows what it is to measure.
+    """
+    lacking = float("nan")
+    if not len(own):
+        return UNKNOWN
+    intensity = float(np.median(own.intensity))
+    beside = float(np.median(around.intensity)) if len(around) else 0.0
+    contrast = 1.0 - intensity / beside if beside > 0.0 else lacking
+    surface = fit(around.x_m, around.y_m, around.height_m)
+    if surface is None:
+        return Severity(contrast, intensity, lacking, lacking, lacking)
+    above = surface.residuals_m(own.x_m, own.y_m, own.height_m)
+    rest = surface.residuals_m(around.x_m, around.y_m, around.height_m)
+    readings = float(own.readings.sum())
+    mean = float(np.sum(own.readings * above)) / readings
+    sigma = float(np.sqrt(np.sum(own.readings * (above - mean) ** 2) / readings))
+    return Severity(contrast, intensity, mean, sigma, scatter_about(rest, float(np.median(rest))))
 
 
 NO_CONTRAST: Final = "no_contrast"
@@ -222,3 +262,81 @@ def _within(points: RoadPoints, shape: shapely.Polygon) -> npt.NDArray[np.bool_]
 def _back(one: Region, origin_m: tuple[float, float], heading_rad: float) -> Region:
     outline = shapely.transform(one.outline, lambda xy: rotated_back(xy, origin_m, heading_rad))
     return replace(one, outline=shapely.orient_polygons(outline))
+
+
+_EDGE_CELLS: Final = 3
+"""Largest movement of a cluster's edge outward to halfway between its intensity and that of the road."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cluster:
+    """Cells that are connected over edges and corners."""
+
+    rows: npt.NDArray[np.int64]
+    columns: npt.NDArray[np.int64]
+
+    def area_m2(self, raster: IntensityRaster) -> float:
+        """Return the area of the cells."""
+        return float(self.rows.size * raster.cell_m**2)
+
+    def hull(self, raster: IntensityRaster, edge_intensity: float | None = None) -> shapely.Polygon:
+        """Return the convex hull of the cells in the frame of the raster (m).
+
+        edge_intensity : its corners lie where the local mean, linear from centre to centre, has this intensity.
+        """
+        if edge_intensity is None:
+            ends = [np.column_stack([self.columns + a, self.rows + b]) for a in (0.0, 1.0) for b in (0.0, 1.0)]
+        else:
+            ends = list(self._ends(raster, edge_intensity))
+        return shapely.convex_hull(shapely.MultiPoint(raster.corner_m + raster.cell_m * np.concatenate(ends)))
+
+    def _ends(self, raster: IntensityRaster, edge: float) -> Iterator[npt.NDArray[np.float64]]:
+        """Return places (n, 2), in cells, where the cluster ends on each of four sides."""
+        own = np.pad(np.zeros(raster.values.shape, bool), 1)
+        own[self.rows + 1, self.columns + 1] = True
+        value = np.pad(raster.local_mean, 1, constant_values=np.nan)
+        for side in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+            beyond = (self.rows + 1 + side[0], self.columns + 1 + side[1])
+            last = ~own[beyond]
+            outer, inner = value[beyond][last], value[self.rows + 1, self.columns + 1][last]
+            crossed = outer > edge  # not where nothing was measured beyond
+            way = np.where(crossed, (edge - inner) / np.where(crossed, outer - inner, 1.0), 0.5)
+            yield np.column_stack([self.columns[last] + 0.5 + way * side[1], self.rows[last] + 0.5 + way * side[0]])
+
+    def at_half(self, raster: IntensityRaster, intensity: float) -> Cluster:
+        """Return the cluster with its edge where the local mean has an intensity, at most three cells farther out.
+
+        It stays as it is if none is left.
+        """
+        top, left = max(int(self.rows.min()) - _EDGE_CELLS, 0), max(int(self.columns.min()) - _EDGE_CELLS, 0)
+        bottom, right = int(self.rows.max()) + _EDGE_CELLS + 1, int(self.columns.max()) + _EDGE_CELLS + 1
+        values = raster.local_mean[top:bottom, left:right]
+        mask = np.zeros(values.shape, np.uint8)
+        mask[self.rows - top, self.columns - left] = 1
+        edge = 2 * _EDGE_CELLS + 1
+        wide = cv2.dilate(mask, np.ones((edge, edge), np.uint8)).astype(bool)
+        rows, columns = np.nonzero(wide & (values <= intensity))
+        return Cluster(rows + top, columns + left) if rows.size else self
+
+
+def clusters_of(
+    raster: IntensityRaster, dim_below: int, least_area_m2: float, among: Sequence[Cluster] | None = None
+) -> tuple[list[Cluster], int]:
+    """Return clusters of cells up to an 8-bit value, from the first row on, and the number of those below an area.
+
+    among : clusters; only their cells are used.
+    """
+    dim = raster.measured & (raster.values <= dim_below)
+    if among is not None:
+        asked = np.zeros(dim.shape, bool)
+        for one in among:
+            asked[one.rows, one.columns] = True
+        dim &= asked
+    count, label, stats, _ = cv2.connectedComponentsWithStats(dim.astype(np.uint8), connectivity=8)
+    large = np.flatnonzero(stats[:, cv2.CC_STAT_AREA] * raster.cell_m**2 >= least_area_m2)
+    found = []
+    for k in large[large > 0].tolist():
+        left, top, width, height = (int(v) for v in stats[k, :4])
+        rows, columns = np.nonzero(label[top : top + height, left : left + width] == k)
+        found.append(Cluster(rows + top, columns + left))
+    return found, count - 1 - len(found)

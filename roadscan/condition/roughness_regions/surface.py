@@ -6,11 +6,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.compute.robust import scatter_about
-
-Float64 = npt.NDArray[np.float64]
 
 _ROUNDS: Final = 12  # Iterations of a robust fit.
 _TUKEY: Final = 4.685

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.index import Value, condition_indices
 from roadscan.condition.lane_data import LaneData, Profile
 from roadscan.condition.settings import ConditionConfig
@@ -18,7 +18,6 @@ from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session
 from roadscan.tiles.tasks.wanted_products import product_context
 
-Float64 = npt.NDArray[np.float64]
 HeightAt: TypeAlias = Callable[[Float64, Float64], Float64]
 """Function that gives true heights (n,) at eastings and northings (n,)."""
 

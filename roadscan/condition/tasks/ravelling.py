@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 import shapely
 
@@ -15,8 +17,8 @@ from roadscan.condition.indices.ravelling import looked_through
 from roadscan.condition.lane_data import LaneData
 from roadscan.condition.on_lane.ravelling import RavelledPatch, RavelledSection
 from roadscan.condition.on_lane.squares import SQUARE_M
-from roadscan.condition.ravelling_picture import DrawnLane, draw_ravelling
 from roadscan.condition.tasks.values import Group, GroupTask, load_lane
+from roadscan.core.canvas import empty_figure
 from roadscan.core.extras import can_draw
 from roadscan.navigation.tasks.recorded_pictures import NOT_DRAWN
 from roadscan.run.code_reach import code_digest
@@ -161,3 +163,45 @@ def _draw(one: PatchTask, lane: LaneData, found: Found) -> OutputRecord:
         size, digest = path.stat().st_size, file_digest(path)
         one.task.store.publish(path, target)
     return OutputRecord(RAVELLING_PICTURES, one.units[0], one.key, target, size, digest)
+
+
+_DOTS_PER_INCH: Final = 110  # Resolution.
+_WIDTH_IN: Final = 11.0  # Width of the picture.
+_HEIGHT_IN: Final = 1.7  # Height of a section.
+_OUTLINE: Final = "#111111"
+_MOST: Final = 2.5
+"""Ratio of the darkest colour."""
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnLane:
+    """A section of a lane with its patches."""
+
+    title: str
+    ratio: npt.NDArray[np.float64]
+    """(along, across) texture over that of the section, from left to right; NaN where unknown."""
+    corner_m: tuple[float, float]
+    """Station, and offset from the lane's middle, of the first square's corner."""
+    square_m: float
+    outlines_m: tuple[npt.NDArray[Any], ...]
+    """(k, 2) stations and offsets from the lane's middle, for each patch."""
+
+
+def draw_ravelling(path: Path, sections: Sequence[DrawnLane]) -> None:
+    """Write the sections one below the other; travel is from left to right, left of the lane is up."""
+    figure = empty_figure(_WIDTH_IN, _HEIGHT_IN * len(sections), _DOTS_PER_INCH)
+    axes = figure.subplots(len(sections), 1, squeeze=False)[:, 0]
+    for one, section in zip(axes, sections, strict=True):
+        along, across = section.ratio.shape
+        x, y = section.corner_m
+        extent = (x, x + along * section.square_m, y + across * section.square_m, y)
+        one.set_facecolor("#dfe8f2")
+        shown = np.ma.masked_invalid(section.ratio.T)
+        one.imshow(shown, cmap="YlOrRd", vmin=1.0, vmax=_MOST, extent=extent, aspect="auto", interpolation="nearest")
+        for outline in section.outlines_m:
+            one.plot(outline[:, 0], outline[:, 1], color=_OUTLINE, linewidth=1.1)
+        one.set_title(f"{section.title}: texture over that of the section, 1 to {_MOST:g}", fontsize=8, loc="left")
+        one.set_xlabel("station (m)", fontsize=7)
+        one.set_ylabel("to the right (m)", fontsize=7)
+        one.tick_params(labelsize=7)
+    figure.savefig(path, metadata={"Software": None})

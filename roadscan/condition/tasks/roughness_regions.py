@@ -6,19 +6,23 @@ import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.road_line import Lane, RoadLine
-from roadscan.condition.roughness_regions.on_road import Stretch, points_of, section_regions, station_and_offset
-from roadscan.condition.roughness_regions.picture import DrawnSection, draw_regions
-from roadscan.condition.roughness_regions.regions import Region, SectionRegions
+from roadscan.condition.roughness_regions.intensity import normalised_intensity
+from roadscan.condition.roughness_regions.points import RoadPoints
+from roadscan.condition.roughness_regions.regions import Region, SectionRegions, find_regions
 from roadscan.condition.roughness_regions.settings import RoughnessRegionsConfig
 from roadscan.condition.tasks.lines import Roads
 from roadscan.condition.tasks.tasks import PieceTask
 from roadscan.condition.tasks.tiles_beside import tiles_beside
+from roadscan.core.canvas import empty_figure
 from roadscan.core.extras import can_draw
 from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
@@ -30,6 +34,7 @@ from roadscan.store.digest import bytes_digest, file_digest
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.schema import table_schema
 from roadscan.store.writer import parquet_bytes
+from roadscan.tiles.cells import TileCells
 from roadscan.tiles.products.geo_table import write_geo_table
 from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tiles import TaskResult
@@ -221,3 +226,122 @@ def _draw(task: RegionTask, piece: Piece, found: Sequence[SectionRegions]) -> Ou
         size, digest = path.stat().st_size, file_digest(path)
         task.store.publish(path, target)
     return OutputRecord(REGION_PICTURES, piece.unit, piece.key, target, size, digest)
+
+
+_FINER: Final = 4.0
+"""Survey cells are joined to blocks of at most this fraction of a raster cell: closer points add no information."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """A piece of a road."""
+
+    line: RoadLine
+    lanes: tuple[Lane, ...]
+    from_m: float
+    to_m: float
+
+
+def points_of(
+    cells: TileCells, corner_m: tuple[float, float], survey_cell_m: float, raster_cell_m: float
+) -> RoadPoints:
+    """Return the cells of a tile as points: blocks of cells, each with the means of its readings.
+
+    corner_m : easting and northing of the tile's south-west corner.
+    """
+    wide = max(1, int(raster_cell_m / _FINER / survey_cell_m + 1e-9))
+    across = -(-cells.cells_per_edge // wide)
+    block = (cells.row.astype(np.int64) // wide) * across + cells.column.astype(np.int64) // wide
+    number, inverse = np.unique(block, return_inverse=True)
+    count = cells.count.astype(np.float64)
+    readings = np.bincount(inverse, count, number.size)
+
+    def mean(values: npt.NDArray[np.generic]) -> Float64:
+        found: Float64 = np.bincount(inverse, count * values.astype(np.float64), number.size) / readings
+        return found
+
+    easting = corner_m[0] + survey_cell_m * (mean(cells.column) + 0.5)
+    northing = corner_m[1] + survey_cell_m * (mean(cells.row) + 0.5)
+    base = float(cells.height_robust_m[0]) if len(cells) else 0.0
+    height = base + mean(cells.height_robust_m - base)
+    return RoadPoints.of(easting, northing, height, mean(cells.intensity_mean), readings)
+
+
+def section_regions(points: Sequence[RoadPoints], piece: Stretch, settings: RoughnessRegionsConfig) -> SectionRegions:
+    """Find the roughness regions of one section of a road.
+
+    Parameters
+    ----------
+    points : of the tiles on its way, on the map; piece : the section, with its line and lanes a little longer.
+    """
+    middle = piece.line.places(np.array([0.5 * (piece.from_m + piece.to_m)]), 0.0)[0]
+    origin = (float(middle[0]), float(middle[1]))
+    heading = float(np.arctan2(middle[2], middle[3]))
+    joined = RoadPoints.of(*(np.concatenate([getattr(p, n) for p in points] or [np.empty(0)]) for n in _COLUMNS))
+    reach = np.hypot(piece.to_m - piece.from_m, settings.width_m)
+    joined = joined.take(np.hypot(joined.x_m - origin[0], joined.y_m - origin[1]) <= reach)
+    station, offset = piece.line.along(np.column_stack([joined.x_m, joined.y_m]), 0.5 * (piece.from_m + piece.to_m))
+    own = (station >= piece.from_m) & (station < piece.to_m) & (np.abs(offset) <= settings.width_m / 2)
+    from_lane = np.full(station.size, np.inf)
+    on_lane = np.zeros(station.size, bool)
+    for lane in piece.lanes:
+        away = np.abs(offset - lane.offsets(station))
+        from_lane = np.minimum(from_lane, away)
+        on_lane |= (away <= lane.width_m / 2) & (station >= lane.first_m) & (station <= lane.last_m + 1.0)
+    own &= on_lane if settings.road == "lanes" else True
+    kept = joined.take(own)
+    if settings.sensor_height_m is not None:
+        height = settings.sensor_height_m
+        reach_m, incidence = np.hypot(from_lane[own], height), np.arctan2(from_lane[own], height)
+        level = normalised_intensity(kept.intensity, reach_m, incidence, height)
+        kept = RoadPoints(kept.x_m, kept.y_m, kept.height_m, level, kept.readings)
+    return find_regions(kept, origin, heading, settings)
+
+
+_COLUMNS: Final = ("x_m", "y_m", "height_m", "intensity", "readings")
+
+
+def station_and_offset(line: RoadLine, place_m: tuple[float, float], guess_m: float) -> tuple[float, float]:
+    """Return station and offset of a place near a station."""
+    station, offset = line.along(np.array([place_m]), guess_m)
+    return float(station[0]), float(offset[0])
+
+
+_DOTS_PER_INCH: Final = 110  # Resolution.
+_WIDTH_IN: Final = 7.0  # Width of a section.
+_OUTLINE: Final = "#d7301f"
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnSection:
+    """A section with its regions, x along the road and y to the left (m)."""
+
+    title: str
+    values: npt.NDArray[np.uint8]
+    """(rows, columns) intensities from black to white, rows to the left."""
+    measured: npt.NDArray[np.bool_]
+    corner_m: tuple[float, float]
+    cell_m: float
+    outlines_m: tuple[npt.NDArray[Any], ...]
+    """(k, 2) outline of each region."""
+
+
+def draw_regions(path: Path, sections: Sequence[DrawnSection]) -> None:
+    """Write the sections one below the other."""
+    heights = [1.0 + _WIDTH_IN * one.values.shape[0] / one.values.shape[1] for one in sections]
+    figure = empty_figure(_WIDTH_IN + 1.0, sum(heights), _DOTS_PER_INCH)
+    axes = figure.subplots(len(sections), 1, squeeze=False, gridspec_kw={"height_ratios": heights})[:, 0]
+    for one, section in zip(axes, sections, strict=True):
+        rows, columns = section.values.shape
+        x, y = section.corner_m
+        extent = (x, x + columns * section.cell_m, y, y + rows * section.cell_m)
+        shown = np.ma.masked_array(section.values, ~section.measured)
+        one.set_facecolor("#dfe8f2")
+        one.imshow(shown, cmap="gray", vmin=0, vmax=255, origin="lower", extent=extent, interpolation="nearest")
+        for outline in section.outlines_m:
+            one.plot(outline[:, 0], outline[:, 1], color=_OUTLINE, linewidth=1.4)
+        one.set_title(section.title, fontsize=9, loc="left")
+        one.set_xlabel("from the section's middle along the road (m)", fontsize=8)
+        one.set_ylabel("to the left (m)", fontsize=8)
+        one.tick_params(labelsize=7)
+    figure.savefig(path, metadata={"Software": None})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sqlite3
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,6 @@ import pyarrow.compute as pc
 import pyarrow.csv as pa_csv
 import shapely
 
-from roadscan.condition.layer_file import write_layer
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.tasks.lines import Roads
 from roadscan.condition.tasks.values import VALUES
@@ -26,10 +26,36 @@ from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.tiles.product import ProductContext
-from roadscan.tiles.products.geo_table import write_geo_table
+from roadscan.tiles.products.geo_table import in_crs_unit, write_geo_table
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+_WRITTEN: Final = "2000-01-01T00:00:00.000Z"
+"""Date of change that a GeoPackage has to state: constant, so that equal tables give equal bytes."""
+
+
+def write_layer(path: Path, table: pa.Table, shapes_m: npt.NDArray[Any], context: ProductContext) -> None:
+    """Write rows with their lines (n,) on the map (m) as one layer, named as the file, in the CRS's unit."""
+    import pyogrio  # slow to import
+
+    shapes = in_crs_unit(shapes_m, context)
+    frame = table.to_pandas()
+    pyogrio.raw.write(
+        path,
+        shapely.to_wkb(shapes),
+        field_data=[frame[name].to_numpy() for name in frame.columns],
+        fields=list(frame.columns),
+        layer=path.stem,
+        driver="GPKG",
+        geometry_type="LineString",
+        crs=context.map.crs,
+    )
+    with sqlite3.connect(path) as file:
+        file.execute("UPDATE gpkg_contents SET last_change = ?", (_WRITTEN,))
+    file.close()
+
 
 SECTIONS: Final = "condition_sections"
 _TABLE: Final = f"{SECTIONS}.parquet"

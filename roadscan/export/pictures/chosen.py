@@ -8,8 +8,8 @@ from pathlib import PurePosixPath
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.crs import LOCAL_WORLD, crs_from_text
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.frames import ENU_FROM_NED
@@ -18,8 +18,6 @@ from roadscan.measuring.poses import PicturePoses
 from roadscan.measuring.work import picked_poses
 from roadscan.poses.trajectory import world_from_ned
 from roadscan.run.session import Session
-
-Float64 = npt.NDArray[np.float64]
 
 JPEG: Final = (".jpg", ".jpeg")
 """Suffixes of pictures whose bytes are copied."""

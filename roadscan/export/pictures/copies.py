@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import UInt8
 from roadscan.core.crs import LOCAL_WORLD
 from roadscan.core.extras import cv2, need
 from roadscan.core.gpstime import utc_from_gps_ns
@@ -26,9 +26,6 @@ from roadscan.pictures.views import Lens
 from roadscan.privacy.hider import Hider, decoded, encoded, hider_of
 from roadscan.run.session import Session
 from roadscan.store.codecs.jpeg_segments import with_tags
-
-UInt8 = npt.NDArray[np.uint8]
-Float64 = npt.NDArray[np.float64]
 
 _SENSOR_MM: Final = 36.0
 """Width of the sensor that the focal length in millimetres refers to (mm): the rig file states pixels alone, and

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import ClassVar, Final, Literal
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 from pydantic import Field
 
+from roadscan.compute.array_types import Int64
 from roadscan.core.counted import counted
 from roadscan.core.errors import ConfigError, FormatError, Missing, TimeSystemError
 from roadscan.core.gpstime import NS_PER_S, UNIT_NS, WEEK_S, Clock, TimeSystem, iso_from_gps_ns
@@ -30,8 +30,6 @@ from roadscan.ingest.reading.stamps import CALENDAR_SCALES, TIME, StampColumn, c
 from roadscan.ingest.reading.text_table import Kind, TextBlock, TextLayout, TextOptions, text_blocks, text_layout
 from roadscan.store.codecs.image_files import SUFFIXES, ImageError, ImageSize, image_size, is_image
 from roadscan.store.codecs.picture_tags import picture_tags, tags_in_words
-
-Int64 = npt.NDArray[np.int64]
 
 FILE: Final = Quantity("file", "text", ("filename", "file_name", "image", "image_file", "name"))
 _TEXTS: Final = (".csv", ".txt", ".tsv")

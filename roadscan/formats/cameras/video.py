@@ -20,13 +20,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.errors import ConfigError, FormatError
 from roadscan.core.extras import need
 from roadscan.store.codecs.avi_index import frames_in_place
 from roadscan.store.codecs.child import Child, ChildError
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _HEAD: Final = struct.Struct("<4d2q")
 LEAST_FRAME_BYTES: Final = 8

@@ -22,6 +22,7 @@ import numpy.typing as npt
 import pyproj
 from pyproj.exceptions import CRSError as ProjCrsError
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.crs import LOCAL_WORLD, crs_from_text
 from roadscan.core.errors import ConfigError, CrsError, FormatError, Missing, TimeSystemError
 from roadscan.core.gpstime import NS_PER_S, Clock, TimeSystem
@@ -38,8 +39,6 @@ from roadscan.formats.clouds.reference_scan import (
 )
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Provisional, Reject
 from roadscan.ingest.reading.records import Sieve, options_of
-
-Float64 = npt.NDArray[np.float64]
 
 _MOST_SCANS: Final = 65_535  # a scan's number has 16 bits
 _LONGEST_SCAN_S: Final = 10 * 86_400.0  # later times of points (s) count as damage

@@ -17,13 +17,11 @@ from xml.etree import ElementTree
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.errors import FormatError
 from roadscan.formats.clouds.reference_scan import CHUNK_POINTS
 from roadscan.ingest.reading.format import Reject
 from roadscan.ingest.reading.records import Sieve
-
-Int64 = npt.NDArray[np.int64]
-Float64 = npt.NDArray[np.float64]
 
 SIGNATURE: Final = b"ASTM-E57"
 NAMESPACE: Final = "{http://www.astm.org/COMMIT/E57/2010-e57-v1.0}"

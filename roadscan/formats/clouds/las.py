@@ -28,6 +28,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.errors import Missing, TimeSystemError
 from roadscan.core.gpstime import NS_PER_S, WEEK_S, Clock, TimeSystem, iso_from_gps_ns
 from roadscan.core.strict import Strict
@@ -40,8 +41,6 @@ from roadscan.ingest.reading.records import Sieve, UnorderedStamps, few_rejects,
 if TYPE_CHECKING:
     import laspy
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _OVERFLOW: Final = "a coordinate overflowed to the least or largest whole number: outside the area of the survey"
 _LEAST_RAW: Final = -(2**31)  # least raw coordinate

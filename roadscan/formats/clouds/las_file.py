@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Final, Self, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Int64
 from roadscan.core.errors import FormatError
 from roadscan.ingest.reading.format import Reject
 from roadscan.store.codecs.laz import Laz, LazChunks, LazError
@@ -23,7 +23,6 @@ from roadscan.store.codecs.laz import Laz, LazChunks, LazError
 if TYPE_CHECKING:
     import laspy
 
-Int64 = npt.NDArray[np.int64]
 
 _CHUNK_POINTS: Final = 120_000  # points of a batch
 _OLDEST_HEADER_BYTES: Final = 227  # bytes of a header block of LAS 1.0 to 1.2

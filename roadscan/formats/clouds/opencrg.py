@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.crs import crs_from_text
 from roadscan.core.errors import ConfigError, CrsError, Missing, TimeSystemError
 from roadscan.core.gpstime import gps_ns_from_utc
@@ -25,8 +26,6 @@ from roadscan.formats.clouds.opencrg_file import CrgBlock, CrgFile, CurvedRegula
 from roadscan.formats.clouds.reference_scan import reference_height
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import options_of
-
-Float64 = npt.NDArray[np.float64]
 
 _ROWS_OF_POINTS: Final = 1 << 16  # points of a chunk of rows
 _ZERO_COLUMNS: Final = {

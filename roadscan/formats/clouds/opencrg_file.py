@@ -34,12 +34,10 @@ from typing import Any, BinaryIO, Final, Self
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64
 from roadscan.compute.reference_line import mitred_normals, vertices
 from roadscan.core.errors import FormatError
 from roadscan.formats.clouds.opencrg_header import BINARY, FARTHEST, KEYS, LINE_BYTES, TEXT_WIDTH, CrgHeader, Encoding
-
-Float64 = npt.NDArray[np.float64]
-Bool = npt.NDArray[np.bool_]
 
 _BLOCK_VALUES: Final = 1 << 20  # numbers of a block of rows
 _LEAST_WAY: Final = 0.01

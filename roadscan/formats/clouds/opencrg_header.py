@@ -11,9 +11,8 @@ from typing import Any, BinaryIO, Final, Literal, Self
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import FormatError
-
-Float64 = npt.NDArray[np.float64]
 
 Encoding = Literal["LRFI", "LDFI", "KRBI", "KDBI"]
 

@@ -14,13 +14,12 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Int64
 from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.formats.clouds.kernels.lzf import expand
 from roadscan.formats.clouds.reference_scan import CHUNK_POINTS, Brightness
 from roadscan.ingest.reading.format import Reject
 from roadscan.ingest.reading.text_table import Kind, TextLayout, text_blocks
-
-Int64 = npt.NDArray[np.int64]
 
 TIMES: Final = ("t", "time", "timestamp", "time_stamp", "offset_time", "gps_time", "point_time", "time_offset")
 """Names by which a field with times of points is known."""

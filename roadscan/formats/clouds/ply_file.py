@@ -17,12 +17,12 @@ from typing import Any, BinaryIO, Final, Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Int64
 from roadscan.core.errors import ConfigError, FormatError
 from roadscan.formats.clouds.reference_scan import CHUNK_POINTS
 from roadscan.ingest.reading.format import Reject
 from roadscan.ingest.reading.text_table import LINE_BYTES_MAX, TextBlock, TextLayout, text_blocks
 
-Int64 = npt.NDArray[np.int64]
 Coding: TypeAlias = Literal["ascii", "binary_little_endian", "binary_big_endian"]
 
 HEADER_BYTES_MAX: Final = 1 << 16  # bytes in which the header has to end

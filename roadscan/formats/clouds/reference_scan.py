@@ -17,6 +17,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyproj
 
+from roadscan.compute.array_types import Int64
 from roadscan.core.crs import LOCAL_WORLD, NO_HEIGHTS, HeightKind, crs_from_text, heights_of
 from roadscan.core.errors import ConfigError, CrsError, Missing, TimeSystemError
 from roadscan.core.gpstime import LATEST_GPS_NS, gps_ns_from_utc
@@ -25,8 +26,6 @@ from roadscan.ingest.reading.format import Item, LogSource, Rows
 from roadscan.ingest.reading.poses import height_in
 from roadscan.ingest.reading.records import Sieve, few_rejects
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 Columns = dict[str, npt.NDArray[Any]]
 
 CHUNK_POINTS: Final = 65_536

@@ -41,6 +41,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
+from roadscan.compute.array_types import Int64
 from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.core.strict import Strict
 from roadscan.core.witness import Finding, Witness
@@ -63,8 +64,6 @@ from roadscan.formats.lidars.pcap import Datagram, Wanted, batches, capture_star
 from roadscan.formats.lidars.view_gaps import Gap, Turns, gap_of, mean_rate
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
-
-Int64 = npt.NDArray[np.int64]
 
 Source: TypeAlias = Callable[[int | None, str | None], Iterator[Datagram | Reject]]
 """Gives a log's packets in file order: those of a length (bytes) and a sender, None for any."""

@@ -16,11 +16,9 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import FormatError
-
-Float64 = npt.NDArray[np.float64]
 
 LEGACY: Final = "LEGACY"
 """Name of the first profile, of packets and of IMU packets; that of metadata which name none."""

@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Int64
 from roadscan.core.errors import ConfigError, FormatError, Missing, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.core.strict import Strict
@@ -38,7 +39,6 @@ from roadscan.ingest.reading.format import Item, LogSource, Rows
 from roadscan.ingest.reading.records import EpochReader, Sieve, few_rejects
 
 Bytes = npt.NDArray[np.uint8]
-Int64 = npt.NDArray[np.int64]
 
 _HEADER_BYTES: Final = 32
 """Bytes of a packet's header, and of its footer, but in the profile LEGACY."""

@@ -27,6 +27,7 @@ import numpy.typing as npt
 import pyarrow as pa
 from pydantic import Field
 
+from roadscan.compute.array_types import Int64
 from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.core.strict import Strict
 from roadscan.formats.lidars.dated_clock import TIME, clock_of, dated_clock
@@ -47,9 +48,6 @@ from roadscan.formats.lidars.robosense_packets import (
 from roadscan.formats.lidars.view_gaps import Gap, Turns, gap_of, mean_rate, waits_ns
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
-
-Int32 = npt.NDArray[np.int32]
-Int64 = npt.NDArray[np.int64]
 
 Source: TypeAlias = Callable[[int, str | None], Iterator[Datagram | Reject]]
 """Gives a log's MSOP packets of a length (bytes) and a sender (None for any); for length 0, all its packets."""

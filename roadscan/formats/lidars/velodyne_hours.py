@@ -14,16 +14,13 @@ from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Int64
 from roadscan.core.errors import ConfigError, Missing, TimeSystemError
 from roadscan.core.gpstime import NS_PER_S, Clock, TimeSystem, leap_seconds_at_unix
 from roadscan.formats.lidars.pcap import Datagram
 from roadscan.formats.lidars.velodyne_packets import LATEST_STAMP_US
 from roadscan.ingest.reading.format import LogSource
-
-Bool = npt.NDArray[np.bool_]
-Int64 = npt.NDArray[np.int64]
 
 POSITION_BYTES: Final = 512  # bytes of a position packet
 HOUR_S: Final = 3600  # seconds of an hour

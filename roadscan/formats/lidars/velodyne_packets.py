@@ -36,6 +36,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import yaml
 
+from roadscan.compute.array_types import Bool, Float32, Int32, Int64
 from roadscan.compute.kernel_options import read_only
 from roadscan.core.errors import ConfigError
 from roadscan.core.gpstime import NS_PER_S
@@ -44,10 +45,6 @@ from roadscan.formats.lidars.view_gaps import TURN, Gap, jumps, mean_rate, steps
 from roadscan.store.readings.packed_returns import BEAMS, PACKED, Beams
 from roadscan.store.schema import table_schema
 
-Bool = npt.NDArray[np.bool_]
-Float32 = npt.NDArray[np.float32]
-Int32 = npt.NDArray[np.int32]
-Int64 = npt.NDArray[np.int64]
 Numbers = npt.NDArray[Any]
 
 DATA_BYTES: Final = 1206  # bytes of a data packet

@@ -13,13 +13,11 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Int64
 from roadscan.core.witness import Finding, Witness
 from roadscan.formats.lidars.pcap import Datagram
 from roadscan.formats.lidars.velodyne_hours import HOUR_S, HOUR_US, POSITION_BYTES, Fix, iso, leaps, unroll
-
-Int64 = npt.NDArray[np.int64]
 
 STEP_US: Final = 250_000
 """Largest delay (µs) with which a busy recording computer stamps packets."""

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.errors import ConfigError, FormatError, Missing, nearest
 from roadscan.core.strict import Strict
 from roadscan.ingest.reading.columns import (
@@ -36,9 +37,6 @@ from roadscan.ingest.reading.text_table import (
     text_blocks,
     text_layout,
 )
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 TICKS: Final = Quantity("ticks", "count", ("encoder_ticks", "wheel_ticks", "pulses"), optional=True)
 DISTANCE: Final = Quantity("distance", "length", ("odometer", "wheel_distance"), optional=True)

@@ -10,6 +10,7 @@ from typing import ClassVar, Final, Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.crs import crs_from_text
 from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.formats.trajectories.level_poses import GEODETIC, GRID, LOCAL, SIGMAS, position_of
@@ -28,8 +29,6 @@ from roadscan.ingest.reading.text_table import (
     text_blocks,
     text_layout,
 )
-
-Float64 = npt.NDArray[np.float64]
 
 _QUALITY: Final = Quantity("quality", "text", ("fix", "solution", "solution_status", "fix_type"), optional=True)
 _COUNTS: Final = (

@@ -11,6 +11,7 @@ from typing import Final, NamedTuple, get_args
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.core.strict import Strict
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
@@ -19,8 +20,6 @@ from roadscan.ingest.reading.poses import GeodeticPlacement
 from roadscan.ingest.reading.records import EpochReader, Sieve, few_rejects, options_of
 from roadscan.ingest.reading.stamps import calendar_ns
 from roadscan.ingest.reading.text_table import byte_pieces, head_of, is_number
-
-Float64 = npt.NDArray[np.float64]
 
 CRS: Final = "EPSG:4979"
 """Latitude and longitude are of WGS 84 (GPX 1.1, element trkpt)."""

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import ClassVar, Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 from pydantic import Field
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import ConfigError, Missing, nearest
 from roadscan.ingest.reading.columns import (
     UNITS,
@@ -36,8 +36,6 @@ from roadscan.ingest.reading.text_table import (
     text_blocks,
     text_layout,
 )
-
-Float64 = npt.NDArray[np.float64]
 
 _AXES: Final = ("x", "y", "z")
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import ClassVar, Final, Literal
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.crs import Geoid
 from roadscan.core.errors import ConfigError, CrsError, FormatError, Missing, TimeSystemError
 from roadscan.core.gpstime import NS_PER_S, Clock, leap_seconds_at_unix
@@ -35,10 +35,6 @@ from roadscan.ingest.reading.gnss import NO_POSITION, GnssReader, RawSolutions, 
 from roadscan.ingest.reading.poses import GeodeticPlacement, check_geographic
 from roadscan.ingest.reading.records import EpochReader, Sieve, drop_failing, few_rejects, options_of
 from roadscan.ingest.reading.text_table import SEARCHED_BYTES, head_of, line_blocks
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 LATE_NS: Final = 2 * NS_PER_S
 """Largest delay of an epoch's sentences relative to others."""

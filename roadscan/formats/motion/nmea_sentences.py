@@ -16,16 +16,14 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow.compute as pc
 
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.ingest.reading.format import Reject
 from roadscan.ingest.reading.gnss import NO_POSITION, QUALITIES, UNKNOWN_QUALITY
 from roadscan.ingest.reading.records import Sieve, few_rejects
 from roadscan.ingest.reading.text_table import Kind, TextBlock, TextLayout, parse_lines
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 Bytes = npt.NDArray[np.uint8]
-Bool = npt.NDArray[np.bool_]
 
 DAY_NS: Final = 86_400 * NS_PER_S  # nanoseconds of a day
 UNTIMED: Final = -1  # time of sentences that state none

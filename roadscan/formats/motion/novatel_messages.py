@@ -15,14 +15,12 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Int64
 from roadscan.core.gpstime import NS_PER_S, WEEK_S
 from roadscan.ingest.reading.format import Reject
 from roadscan.ingest.reading.records import Sieve, few_rejects
 from roadscan.ingest.reading.text_table import Kind, TextBlock, TextLayout, head_of, line_blocks, parse_lines
-
-Int64 = npt.NDArray[np.int64]
 
 FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
     "INSPVAXA": (

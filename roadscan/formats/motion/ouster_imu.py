@@ -12,6 +12,7 @@ import numpy.typing as npt
 import pyarrow as pa
 from pydantic import Field
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import FormatError, Missing
 from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2
 from roadscan.core.strict import Strict
@@ -22,8 +23,6 @@ from roadscan.formats.lidars.pcap import Datagram, batches, datagrams_of_sizes
 from roadscan.formats.motion.imu_csv import FORCE_MAX_M_PER_S2, RATE_MAX_RAD_PER_S
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside
 from roadscan.ingest.reading.records import EpochReader, Sieve, few_rejects, options_of
-
-Float64 = npt.NDArray[np.float64]
 
 _BEFORE_SAMPLES: Final = 32 + 100
 """Bytes of the newer packets before their samples: header, and a stamp with an NMEA sentence."""

@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.crs import crs_from_text, world_frame_of, world_from_geodetic
 from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
@@ -17,9 +18,6 @@ from roadscan.core.settings.ppk import PpkBase, PpkSettings
 from roadscan.core.witness import Finding, Witness
 from roadscan.formats.motion.rinex import RinexHeader
 from roadscan.ingest.reading.gnss import ned_from_ecef
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 BASE_REFUSED_M: Final = 20.0
 """Farther than this from its own code solution, a base stands elsewhere or its position is of another datum or kind of

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import ClassVar, Final, Literal, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow.compute as pc
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.crs import LOCAL_WORLD, crs_from_text, world_from_geodetic
 from roadscan.core.errors import ConfigError, CrsError, FormatError, Missing, RoadscanError, TimeSystemError
 from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, WEEK_S, Clock, TimeSystem
@@ -37,9 +37,6 @@ from roadscan.ingest.reading.poses import (
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
 from roadscan.ingest.reading.stamps import parse_calendar
 from roadscan.ingest.reading.text_table import Kind, TextBlock, TextLayout, first_fields, head_of, text_blocks
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 Solution: TypeAlias = Literal["lat/lon/height", "x/y/z-ecef", "e/n/u-baseline"]
 

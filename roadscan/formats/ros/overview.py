@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar, Final, Protocol, runtime_checkable
+from typing import Any, ClassVar, Final, Protocol, runtime_checkable
 
+import numpy as np
+
+from roadscan.compute.array_types import Float64
 from roadscan.core.counted import counted
+from roadscan.core.frames import BODY_FROM_AXES, rotation_from_quaternion, rph_from_rotation
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.formats.ros.bag import Bag, Topic, bag_files
 from roadscan.formats.ros.containers.mcap_file import McapFile
 from roadscan.formats.ros.containers.ros1_file import Ros1File
 from roadscan.formats.ros.containers.sqlite_file import SqliteFile
-from roadscan.formats.ros.transforms import StaticTransforms, first_contents, static_transforms
-from roadscan.ingest.reading.format import Contents, Part
+from roadscan.ingest.reading.format import Contents, Part, Reject
 
 _KINDS: Final[dict[type, str]] = {Ros1File: "ROS 1", SqliteFile: "ROS 2 (SQLite)", McapFile: "ROS 2 (MCAP)"}
 _UNPACKED: Final = tuple(f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "TimeReference"))
@@ -77,3 +82,140 @@ def _frame(bag: Bag, topic: Topic) -> str:
         posed = getattr(content, "child_frame_id", "")
         return str(posed or getattr(getattr(content, "header", None), "frame_id", ""))
     return ""
+
+
+_TYPES: Final = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")  # the second is that of ROS 1 before tf2
+_NAME: Final = "tf_static"
+_VEHICLES: Final = ("base_link", "base_footprint")  # frames of the vehicle (REP 105, 120); the first that is named
+_MOST_MESSAGES: Final = 100  # messages of transforms that are read
+_MOST_REJECTS: Final = 1_000  # messages that cannot be read before a topic is given up
+_TURN_OFF: Final = 0.01  # of the length of a quaternion from 1; tf2 refuses such a transform, too
+_SAME: Final = 1e-6  # by which two statements of one transform may differ (m, and of the rotation's matrix)
+_FLU: Final = np.diag([1.0, -1.0, -1.0])  # forward, right, down from x ahead, y left, z up (REP 103)
+
+
+@dataclass
+class StaticTransforms:
+    """The tree of the static transforms of a bag."""
+
+    steps: dict[str, tuple[str, Float64]] = field(default_factory=dict)
+    """By frame: its parent, and the pose (4, 4) parent from frame."""
+    faults: dict[str, str] = field(default_factory=dict)
+    """By frame: why the transform that places it is not used, a sentence each."""
+
+    @property
+    def vehicle(self) -> str:
+        """The frame of the vehicle: `base_link`, and `base_footprint` where no transform names the first."""
+        named = {*self.steps, *(parent for parent, _ in self.steps.values())}
+        return next((one for one in _VEHICLES if one in named), _VEHICLES[0])
+
+    def mounting(self, frame: str) -> tuple[dict[str, Any], str]:
+        """Return a frame's mounting on the vehicle's frame; without one, why it has none ("" if none is stated)."""
+        frame, vehicle, pose = _plain(frame), self.vehicle, np.eye(4)
+        if frame in {"", vehicle}:
+            return {}, ""
+        at = frame
+        while at != vehicle:
+            if at in self.faults:
+                return {}, self.faults[at]
+            if at not in self.steps:
+                return {}, self._apart(frame)
+            at, step = self.steps[at]
+            pose = step @ pose
+        return _mounting(pose), ""
+
+    def take(self, parent: str, child: str, transform: Any) -> None:
+        """Take one transform; one that contradicts itself or an earlier one becomes a fault."""
+        pose = _pose(transform)
+        if child in self.steps:
+            before, known = self.steps[child]
+            if pose is None or before != parent or not np.allclose(known, pose, rtol=0.0, atol=_SAME):
+                self.faults[child] = f"the static transforms place the frame {child} in two ways"
+            return
+        self.steps[child] = parent, np.eye(4) if pose is None else pose
+        if pose is None:
+            self.faults[child] = (
+                f"the static transform of {child} on {parent} is not finite, or its quaternion is not of length 1"
+            )
+
+    def find_cycles(self) -> None:
+        """Make faults of transforms that go round."""
+        seen = set[str]()
+        for frame in self.steps:
+            way, at = list[str](), frame
+            while at in self.steps and at not in seen:
+                seen.add(at)
+                way.append(at)
+                at = self.steps[at][0]
+            ring = way[way.index(at) :] if at in way else []
+            for one in ring:
+                self.faults.setdefault(one, f"the static transforms go round: {' on '.join([*ring, at])}")
+
+    def _apart(self, frame: str) -> str:
+        parents = {parent for parent, _ in self.steps.values()}
+        if frame not in self.steps and frame not in parents:
+            return ""  # no transform names it
+        above, at = set[str](), self.vehicle
+        while at in self.steps and at not in above:
+            above.add(at)
+            at = self.steps[at][0]
+        if frame in above | {at}:
+            return f"{self.vehicle} stands on the frame {frame} by the static transforms, not the other way round"
+        return f"the static transforms do not place the frame {frame} on {self.vehicle}"
+
+
+def static_transforms(bag: Bag) -> StaticTransforms:
+    """Return the static transforms of a bag; those that contradict themselves are its faults."""
+    found = StaticTransforms()
+    for topic in bag.topics.values():
+        if topic.type in _TYPES and topic.name.split("/")[-1] == _NAME:
+            for content in first_contents(bag, topic, _MOST_MESSAGES):
+                for one in content.transforms:
+                    found.take(_plain(one.header.frame_id), _plain(one.child_frame_id), one.transform)
+    found.find_cycles()
+    return found
+
+
+def first_contents(bag: Bag, topic: Topic, most: int) -> Iterator[Any]:
+    """Yield the content of the first messages that can be read; nothing where the type cannot be."""
+    good = bad = 0
+    try:
+        for item in bag.decoded(topic.name):
+            if isinstance(item, Reject):
+                bad += 1
+            else:
+                good += 1
+                yield item[1]
+            if good >= most or bad >= _MOST_REJECTS:
+                return
+    except Exception:  # noqa: BLE001 — a listing names what can be named: a type without a definition, a missing package
+        return
+
+
+def _plain(frame: str) -> str:
+    return frame.strip("/")
+
+
+def _pose(transform: Any) -> Float64 | None:
+    """Return the pose (4, 4) of a transform; None where it is none."""
+    turn, shift = transform.rotation, transform.translation
+    quaternion = np.array([turn.w, turn.x, turn.y, turn.z])
+    pose = np.eye(4)
+    pose[:3, 3] = shift.x, shift.y, shift.z
+    if not np.isfinite(pose).all() or not abs(np.linalg.norm(quaternion) - 1.0) <= _TURN_OFF:
+        return None
+    pose[:3, :3] = rotation_from_quaternion(quaternion)
+    return pose
+
+
+def _mounting(pose: Float64) -> dict[str, Any]:
+    """Return lever arm, axes and boresight as the rig file states them, if the root is x ahead, y left, z up."""
+    turn = _FLU @ pose[:3, :3]
+    axes = max(BODY_FROM_AXES, key=lambda name: float(np.trace(turn @ BODY_FROM_AXES[name].T)))
+    angles = np.degrees(rph_from_rotation(turn @ BODY_FROM_AXES[axes].T))
+    angles = np.round((np.asarray(angles) + 180.0) % 360.0 - 180.0, 6) + 0.0
+    return {
+        "lever_arm_body_m": [round(float(value), 6) + 0.0 for value in _FLU @ pose[:3, 3]],
+        "axes": axes,
+        "boresight": dict(zip(("roll_deg", "pitch_deg", "heading_deg"), map(float, angles), strict=True)),
+    }

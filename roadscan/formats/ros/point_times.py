@@ -18,8 +18,6 @@ import numpy.typing as npt
 from roadscan.core.errors import Missing, TimeSystemError
 from roadscan.core.gpstime import NS_PER_S, SCALES, TAI_MINUS_GPS_S, UNIT_NS, ahead_of_utc_s
 
-Float64 = npt.NDArray[np.float64]
-
 FIELDS: Final = ("t", "time", "timestamp", "time_stamp", "offset_time", "timestamps", "point_time", "time_offset")
 """Names by which a field with times of points is known."""
 Origin = Literal["header", "epoch"]

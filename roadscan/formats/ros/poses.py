@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from typing import Any, ClassVar, Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.crs import LOCAL_WORLD, crs_from_text
 from roadscan.core.frames import ENU_FROM_NED, quaternion_from_rotation
 from roadscan.core.strict import Strict
@@ -27,8 +27,6 @@ from roadscan.ingest.reading.poses import (
     unit_quaternions,
 )
 from roadscan.ingest.reading.records import Sieve, options_of
-
-Float64 = npt.NDArray[np.float64]
 
 _NED_FROM_ENU: Final = quaternion_from_rotation(ENU_FROM_NED.T)
 _SIGMAS: Final = {"sigma_east_m": 0, "sigma_north_m": 7, "sigma_down_m": 14}

@@ -49,6 +49,7 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 from pydantic import Field
 
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.crs import LOCAL_WORLD
 from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.core.gpstime import Clock, TimeSystem
@@ -67,10 +68,6 @@ from roadscan.ingest.reading.format import (
 from roadscan.ingest.reading.poses import LevelPlacement, PoseReader, RawPoses, ned_from_rph
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
 from roadscan.ingest.reading.text_table import SEARCHED_BYTES, head_of, line_blocks
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 Pose = Literal["laser", "robot", "odom", "none"]
 

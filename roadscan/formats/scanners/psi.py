@@ -35,6 +35,7 @@ import numpy.typing as npt
 import pyarrow as pa
 from pydantic import Field
 
+from roadscan.compute.array_types import Int64, UInt8, UInt16
 from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.core.gpstime import NS_PER_S, Clock, TimeSystem
 from roadscan.core.scan_geometry import ScanGeometry
@@ -44,10 +45,6 @@ from roadscan.formats.scanners.psi_container import PsiFile, PsiSection, is_psi
 from roadscan.ingest.reading.columns import UNITS
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
-
-UInt8 = npt.NDArray[np.uint8]
-UInt16 = npt.NDArray[np.uint16]
-Int64 = npt.NDArray[np.int64]
 
 STATEMENT_KEY: Final = "roadscan_psi"
 """Metadata key of a JSON object in which a file states what the draft leaves open."""

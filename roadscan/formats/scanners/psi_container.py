@@ -30,12 +30,10 @@ from typing import Any, Final, Literal, Self
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import UInt8, UInt16
 from roadscan.core.errors import FormatError
 from roadscan.core.extras import cv2
 from roadscan.store.codecs.image_files import ImageError, jpeg_size, plain_png, png_size
-
-UInt8 = npt.NDArray[np.uint8]
-UInt16 = npt.NDArray[np.uint16]
 
 INFLATION_FACTOR: Final = 100
 """A compressed image may be this many times larger than its stored bytes …"""

@@ -44,6 +44,7 @@ import numpy.typing as npt
 import pyarrow as pa
 from pydantic import Field
 
+from roadscan.compute.array_types import Bool, Int64, UInt8, UInt16
 from roadscan.core.errors import ConfigError, FormatError, Missing, nearest
 from roadscan.core.gpstime import NS_PER_S, UNIT_NS, Clock, TimeSystem
 from roadscan.core.scan_geometry import ScanGeometry
@@ -69,11 +70,6 @@ from roadscan.formats.scanners.sick_telegrams import (
 )
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Provisional, Reject, Rows, beside
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
-
-UInt8 = npt.NDArray[np.uint8]
-UInt16 = npt.NDArray[np.uint16]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 READ: Final = (ALL_VALUES, SUBRANGE, VALUES_AND_REMISSION)
 """Commands whose values are read."""

@@ -24,13 +24,9 @@ from pathlib import Path
 from typing import IO, Final, Literal
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Int64, UInt8, UInt16
 from roadscan.core.errors import FormatError
-
-UInt8 = npt.NDArray[np.uint8]
-UInt16 = npt.NDArray[np.uint16]
-Int64 = npt.NDArray[np.int64]
 
 STX: Final = 0x02  # first byte of a telegram
 FROM_SCANNER: Final = 0x80  # address of a scanner's telegrams

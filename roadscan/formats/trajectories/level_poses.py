@@ -9,13 +9,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.crs import LOCAL_WORLD, crs_from_text
 from roadscan.ingest.reading.columns import Found, Quantity
 from roadscan.ingest.reading.poses import RawPoses, check_rph, ned_from_rph
 from roadscan.ingest.reading.records import Sieve
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 GEODETIC: Final = (
     Quantity("longitude", "angle", ("lon", "lng")),

@@ -20,6 +20,7 @@ from typing import ClassVar, Final, get_args
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.crs import HeightKind, crs_from_text
 from roadscan.core.errors import ConfigError, FormatError, Missing, TimeSystemError
 from roadscan.core.gpstime import NS_PER_S, WEEK_S, Clock, TimeSystem, gps_week_of_date
@@ -48,9 +49,6 @@ from roadscan.ingest.reading.text_table import (
     is_number,
     text_blocks,
 )
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _UNIT_WORDS: Final = {
     "deg": ("angle", "deg"), "degrees": ("angle", "deg"), "°": ("angle", "deg"), "rad": ("angle", "rad"),

@@ -10,6 +10,7 @@ from typing import ClassVar, Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import ConfigError, FormatError, Missing, nearest
 from roadscan.core.frames import BODY_FROM_AXES, body_from_axes, quaternion_from_rotation
 from roadscan.core.gpstime import Clock
@@ -37,8 +38,6 @@ from roadscan.ingest.reading.text_table import (
     text_blocks,
     text_layout,
 )
-
-Float64 = npt.NDArray[np.float64]
 
 MATRIX: Final = tuple(f"r{row}{column}" for row in "123" for column in "123")
 TRANSLATION: Final = ("t1", "t2", "t3")

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.crs import LOCAL_WORLD, crs_from_text
 from roadscan.core.errors import FormatError
 from roadscan.core.frames import ENU_FROM_NED, quaternion_from_rotation
@@ -43,9 +44,6 @@ from roadscan.ingest.reading.text_table import (
     text_blocks,
     text_layout,
 )
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 QUATERNION: Final = ("qw", "qx", "qy", "qz")
 TRANSLATION: Final = ("tx", "ty", "tz")

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.crs import LOCAL_WORLD, crs_from_text
 from roadscan.core.errors import ConfigError, FormatError, Missing, nearest
 from roadscan.core.frames import ENU_FROM_NED, quaternion_from_rotation
@@ -36,8 +36,6 @@ from roadscan.ingest.reading.text_table import (
     text_blocks,
     text_layout,
 )
-
-Float64 = npt.NDArray[np.float64]
 
 STAMP: Final = "GPSTime"
 POSITION: Final = ("easting", "northing", "altitude")

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import BinaryIO, ClassVar, Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.crs import LOCAL_WORLD
 from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.core.gpstime import NS_PER_S, UNIT_NS, WEEK_S, Clock
@@ -29,8 +29,6 @@ from roadscan.ingest.reading.poses import (
 )
 from roadscan.ingest.reading.records import Sieve, options_of
 from roadscan.ingest.reading.text_table import head_of
-
-Float64 = npt.NDArray[np.float64]
 
 FIELDS: Final = 17  # doubles of a record
 RECORD_BYTES: Final = 8 * FIELDS  # bytes of a record

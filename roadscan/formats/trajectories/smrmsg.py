@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.errors import FormatError
 from roadscan.core.gpstime import WEEK_S, Clock
 from roadscan.core.toml_text import toml
@@ -18,10 +18,6 @@ from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource
 from roadscan.ingest.reading.poses import SIGMA_MAX_DEG, SIGMA_MAX_M, block_rows, check_sigmas
 from roadscan.ingest.reading.records import LEAP_NS, EpochReader, Sieve
 from roadscan.ingest.reading.text_table import byte_pieces, head_of
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 FIELDS: Final = 10  # doubles of a record
 RECORD_BYTES: Final = 8 * FIELDS  # bytes of a record

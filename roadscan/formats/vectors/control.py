@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.crs import (
     LOCAL_WORLD,
     Geoid,
@@ -30,8 +30,6 @@ from roadscan.ingest.reading.format import Item, LogSource, Rows
 from roadscan.ingest.reading.poses import GRID_MAX_M, HEIGHT_MAX_M, HEIGHT_MIN_M, height_in
 from roadscan.ingest.reading.records import Sieve, drop_failing
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 Index = Int64 | slice
 
 Role = Literal["gcp", "check"]

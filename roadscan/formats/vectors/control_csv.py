@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import ClassVar, Final, Literal
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.crs import crs_from_text
 from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.formats.vectors.control import ControlFrame, ControlReader, RawControl, Role, need_role
@@ -29,8 +29,6 @@ from roadscan.ingest.reading.text_table import (
     text_blocks,
     text_layout,
 )
-
-Float64 = npt.NDArray[np.float64]
 
 NAME: Final = Quantity(
     "name", "text",

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import shapely
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import ConfigError, FormatError, RoadscanError
 from roadscan.formats.vectors.control import NO_TEXT, SIGMA_MAX_M, ControlFrame, Role
 from roadscan.formats.vectors.control_csv import GEODETIC, GRID, HEIGHT, LOCAL, SIGMAS, units_of
@@ -33,8 +33,6 @@ from roadscan.ingest.reading.columns import ColumnOption, Quantity, find_columns
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import Sieve, options_of
 from roadscan.ingest.reading.text_table import Kind, TextOptions, sniff_layout, text_blocks, text_layout
-
-Float64 = npt.NDArray[np.float64]
 
 LineKind = Literal["paint", "kerb"]
 _KINDS: Final = ("paint", "kerb")

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import shapely
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.crs import LOCAL_WORLD, crs_from_text
 from roadscan.core.errors import ConfigError, CrsError, FormatError, nearest
 from roadscan.core.strict import Strict
@@ -35,8 +35,6 @@ from roadscan.formats.vectors.vector_layer import (
 from roadscan.ingest.reading.columns import UNITS
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource
 from roadscan.ingest.reading.records import options_of
-
-Float64 = npt.NDArray[np.float64]
 
 
 class ControlVectorOptions(Strict):

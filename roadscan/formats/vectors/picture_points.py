@@ -7,14 +7,11 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.ingest.reading.format import Item, Rows
 from roadscan.ingest.reading.records import Sieve
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 TABLE: Final = "picture_points"
 BY_HAND, FOUND = "by hand", "found"

@@ -29,6 +29,7 @@ import shapely
 from pydantic import Field
 from pyproj.exceptions import ProjError
 
+from roadscan.compute.array_types import Bool, Float64
 from roadscan.core.crs import LOCAL_WORLD, MapFrame, crs_from_text, world_from_geodetic
 from roadscan.core.errors import ConfigError, CrsError, FormatError, nearest
 from roadscan.core.strict import Strict
@@ -54,9 +55,6 @@ from roadscan.ingest.reading.columns import UNITS
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Provisional, Reject, Rows
 from roadscan.ingest.reading.poses import GRID_MAX_M
 from roadscan.ingest.reading.records import Sieve, options_of
-
-Float64 = npt.NDArray[np.float64]
-Bool = npt.NDArray[np.bool_]
 
 _EXPECTED: Final = "a layer of lines"
 _SHAPE_CODE: Final = 9994  # magic number of a shapefile

@@ -11,6 +11,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Int64
 from roadscan.core.errors import NavigationError
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.georeference.sources import MountingChanges, ReadingSource, change_of, load_mounting_changes
@@ -20,7 +21,6 @@ from roadscan.poses.movement import Allowance, allowance_for, largest
 from roadscan.poses.trajectory import STENCIL_KNOTS, Corrections
 from roadscan.store.store import Store
 
-Int64 = npt.NDArray[np.int64]
 UInt64 = npt.NDArray[np.uint64]
 
 

@@ -6,14 +6,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.navigation.clocks.signals import Felt, Motion
-
-Bool = npt.NDArray[np.bool_]
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 STEP_S: Final = 0.05
 """Width of the bins of the coarse search."""

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.clock_evidence import Drift
 from roadscan.core.errors import NavigationError
 from roadscan.core.gpstime import NS_PER_S
@@ -16,9 +16,6 @@ from roadscan.ingest.clocks.lines import Line, robust_line
 from roadscan.navigation.clocks.lag import STEP_S, Lag, coarse_lag
 from roadscan.navigation.clocks.signals import Felt, Motion
 from roadscan.navigation.clocks.windows import LEAST_SAMPLES, LEAST_WINDOWS, Lags, Windows
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _CHUNK_S: Final = 300.0
 """The coarse lag is found in pieces of this length, since a drifting clock has no single lag."""

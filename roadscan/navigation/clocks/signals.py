@@ -8,19 +8,15 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.crs import LOCAL_WORLD
 from roadscan.core.errors import NavigationError
 from roadscan.core.frames import rotation_from_quaternion
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.navigation.inertial.readings import ImuReadings, OdometerReadings
 from roadscan.poses.trajectory import Trajectory
-
-Bool = npt.NDArray[np.bool_]
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 EARTH_RATE_RAD_PER_S: Final = 7.292115e-5
 """Angular rate of the Earth (WGS 84)."""

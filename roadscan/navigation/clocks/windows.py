@@ -6,15 +6,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import scipy
 
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.ingest.clocks.lines import Line
 from roadscan.navigation.clocks.signals import Felt, Motion
-
-Bool = npt.NDArray[np.bool_]
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 LEAST_SAMPLES: Final = 20  # Least number of samples of a window.
 LEAST_WINDOWS: Final = 3  # Least number of windows.

@@ -30,8 +30,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.compute.robust import scatter_about
 from roadscan.core.errors import NavigationError
 from roadscan.core.frames import rotation_from_quaternion
@@ -48,10 +48,6 @@ from roadscan.navigation.inertial.readings import (
 )
 from roadscan.navigation.inertial.smoother import solve
 from roadscan.navigation.inertial.timeline import chosen
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 WITHHELD_S: Final = 10.0
 """Length of a stretch of GNSS that is withheld, where the run has no outages."""

@@ -10,18 +10,14 @@ from dataclasses import dataclass
 from typing import Final, NoReturn
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64
 from roadscan.compute.flags import runs_of
 from roadscan.core.errors import ConfigError, NavigationError, TimeSystemError
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2
 from roadscan.navigation.inertial.motion import STEP_S, Windows, imu_means
 from roadscan.navigation.inertial.readings import ImuReadings, VehicleSensors
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 TILT_DRIVING_DEG: Final = 10.0
 """Largest angle between gravity, corrected for the road's slope, and its direction by the mounting."""
@@ -57,7 +53,7 @@ class Felt:
     """(n, 3) rad/s."""
     force: Float64
     """(n, 3) m/s²."""
-    known: Flags
+    known: Bool
     """(n,) True where the IMU log covers the window."""
     sample_s: float
     """Time between samples."""
@@ -306,7 +302,7 @@ def _check_turning_while_standing(felt: Felt) -> None:
         )
 
 
-def _check_slope(felt: Felt, ok: Flags, vehicle: VehicleSensors) -> None:
+def _check_slope(felt: Felt, ok: Bool, vehicle: VehicleSensors) -> None:
     w = felt.windows
     signs = np.where(directions(felt) < 0, -1.0, 1.0)
     mean = felt.force[ok].mean(axis=0) - [(signs * w.along)[ok].mean(), (signs * w.aside)[ok].mean(), 0.0]
@@ -315,7 +311,7 @@ def _check_slope(felt: Felt, ok: Flags, vehicle: VehicleSensors) -> None:
         _wrong_gravity(mean, vehicle, tilt, TILT_DRIVING_DEG)
 
 
-def _check_turn(felt: Felt, ok: Flags, vehicle: VehicleSensors, gnss_name: str) -> None:
+def _check_turn(felt: Felt, ok: Bool, vehicle: VehicleSensors, gnss_name: str) -> None:
     """Compare the turn of the course with the three rates: axis, sign, unit and time."""
     turn, rate = felt.windows.turn, felt.rate
     alike = np.array([_alike(rate[ok, k], turn[ok]) for k in range(3)])
@@ -351,7 +347,7 @@ def _check_leaning(alike: Float64, slope: Float64) -> None:
             )
 
 
-def _check_along(felt: Felt, ok: Flags, vehicle: VehicleSensors) -> None:
+def _check_along(felt: Felt, ok: Bool, vehicle: VehicleSensors) -> None:
     w = felt.windows
     along, aside = w.along[ok] - w.along[ok].mean(), w.aside[ok] - w.aside[ok].mean()
     force = felt.force[ok] - felt.force[ok].mean(axis=0)
@@ -377,7 +373,7 @@ def _check_along(felt: Felt, ok: Flags, vehicle: VehicleSensors) -> None:
             )
 
 
-def _check_lag(felt: Felt, ok: Flags, signs: Float64, vehicle: VehicleSensors) -> None:
+def _check_lag(felt: Felt, ok: Bool, signs: Float64, vehicle: VehicleSensors) -> None:
     """Check clocks that differ by a part of a second: find the lag that removes most of the difference."""
     w = felt.windows
     total, weight = 0.0, 0.0
@@ -429,7 +425,7 @@ def _check_tilt(felt: Felt, signs: Float64, vehicle: VehicleSensors) -> None:
         _wrong_axis(what, _BODY[axis], "gyroscope", direction, alike, vehicle)
 
 
-def _small_lag(motion: Float64, feels: Float64, ok: Flags) -> tuple[float, float]:
+def _small_lag(motion: Float64, feels: Float64, ok: Bool) -> tuple[float, float]:
     """Return the delay (s) of a signal, and its σ, from the first-order change with time."""
     a, b = motion - motion[ok].mean(), feels - feels[ok].mean()
     lag, sigma = 0.0, np.inf
@@ -448,7 +444,7 @@ def _small_lag(motion: Float64, feels: Float64, ok: Flags) -> tuple[float, float
 
 
 def _wrong_time(
-    felt: Felt, ok: Flags, motion: Float64, signals: list[Float64], what: str, alike: float, gnss_name: str
+    felt: Felt, ok: Bool, motion: Float64, signals: list[Float64], what: str, alike: float, gnss_name: str
 ) -> None:
     """Reject motions that disagree at the stated times; name the time at which they agree, if any."""
     best = max((_best_lag(s, felt.known, motion, ok) for s in signals), key=lambda found: found[1])
@@ -463,7 +459,7 @@ def _wrong_time(
         )
 
 
-def _check_other_time(felt: Felt, ok: Flags, motion: Float64, feels: Float64, alike: float) -> None:
+def _check_other_time(felt: Felt, ok: Bool, motion: Float64, feels: Float64, alike: float) -> None:
     """Reject a motion that agrees much better at another time."""
     lag, there = _best_lag(feels, felt.known, motion, ok)
     if there > 0.97 and there > abs(alike) + 0.1 and abs(lag) > LAG_S:
@@ -548,7 +544,7 @@ def _hint(ratio: float, units: dict[str, float]) -> str:
     return "check the unit"
 
 
-def _best_lag(late: Float64, late_known: Flags, motion: Float64, known: Flags) -> tuple[float, float]:
+def _best_lag(late: Float64, late_known: Bool, motion: Float64, known: Bool) -> tuple[float, float]:
     """Lag (s) with the highest correlation of a signal with a motion, and that correlation, up to ±10 min."""
     a, b = np.where(known, motion, 0.0), np.where(late_known, late, 0.0)
     m, n = known.astype(np.float64), late_known.astype(np.float64)

@@ -14,17 +14,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.errors import NavigationError
 from roadscan.navigation.inertial.earth import EARTH_RATE_ECEF_RAD_PER_S, ecef_from_level, gravity_ecef
 from roadscan.navigation.inertial.kernels.strapdown import increments, turned_frame
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, VehicleSensors
 from roadscan.navigation.inertial.timeline import merged
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 _SPACING_NS: Final = 500_000_000
 """Least interval over which changes of velocity are compared."""

@@ -12,8 +12,8 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.compute.flags import runs_of
 from roadscan.core.errors import NavigationError, TimeSystemError
 from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, WEEK_S, iso_from_gps_ns
@@ -49,9 +49,6 @@ from roadscan.navigation.inertial.records import (
 
 __all__ = ["Prepared", "Repair", "prepared"]
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 LEAST_OVERLAP_S: Final = 2.0
 """Least time that IMU and GNSS log have in common."""
@@ -235,7 +232,7 @@ def _compared(
 
 
 def _counting_right(
-    readings: Kept[OdometerReadings], windows: Windows, speed: Float64, signs: Float64, hangs: Flags
+    readings: Kept[OdometerReadings], windows: Windows, speed: Float64, signs: Float64, hangs: Bool
 ) -> Kept[OdometerReadings]:
     """Return the odometer with forward positive, without drives in which it hangs or counts the wrong way."""
     told = windows.driving & (signs != 0.0) & (np.abs(speed) > 1e-3)
@@ -262,7 +259,7 @@ def _counting_right(
     return _without(readings, windows, _whole_stints(windows, wrong), what)
 
 
-def _without(readings: Kept[OdometerReadings], windows: Windows, bad: Flags, what: str) -> Kept[OdometerReadings]:
+def _without(readings: Kept[OdometerReadings], windows: Windows, bad: Bool, what: str) -> Kept[OdometerReadings]:
     """Return the odometer as speeds, without the windows in which it is wrong, across which no distance counts."""
     if not bad.any():
         return readings
@@ -300,7 +297,7 @@ def _speeds(log: OdometerReadings, piece: Int64) -> tuple[Int64, Float64, Int64]
     return log.epochs_gps_ns[ends[:-1]] + steps // 2, np.diff(log.distance_m[ends]) * NS_PER_S / steps, ends[:-1]
 
 
-def _rows_of(epochs: Int64, windows: Windows, bad: Flags) -> Int64:
+def _rows_of(epochs: Int64, windows: Windows, bad: Bool) -> Int64:
     """Return rows whose epochs lie in runs of bad windows, with half a window and a step around."""
     half = round((windows.window_s / 2 + STEP_S) * NS_PER_S)
     inside = np.zeros(epochs.size, dtype=bool)
@@ -310,7 +307,7 @@ def _rows_of(epochs: Int64, windows: Windows, bad: Flags) -> Int64:
     return np.flatnonzero(inside)
 
 
-def _long(flags: Flags, least_s: float) -> Flags:
+def _long(flags: Bool, least_s: float) -> Bool:
     """Return the runs of flags of at least this length."""
     out = np.zeros_like(flags)
     for a, b in runs_of(flags):
@@ -318,7 +315,7 @@ def _long(flags: Flags, least_s: float) -> Flags:
     return out
 
 
-def _whole_stints(windows: Windows, wrong: Flags) -> Flags:
+def _whole_stints(windows: Windows, wrong: Bool) -> Bool:
     """Return the stints of which the greater part is wrong."""
     out = np.zeros_like(wrong)
     for a, b in windows.stints:

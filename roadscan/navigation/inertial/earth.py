@@ -8,11 +8,9 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.navigation.inertial.kernels.strapdown import EARTH_RATE_RAD_PER_S, geodetic_of, gravity_at
-
-Float64 = npt.NDArray[np.float64]
 
 EARTH_RATE_ECEF_RAD_PER_S: Final[Float64] = np.array([0.0, 0.0, EARTH_RATE_RAD_PER_S])  # ECEF axes.
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.compute.flags import runs_of
 from roadscan.compute.robust import scatter_about
 from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
@@ -22,10 +22,6 @@ from roadscan.core.frames import ENU_FROM_NED, ecef_from_ned
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 STEP_S: Final = 0.1
 """Interval between the windows' middles."""
@@ -56,9 +52,9 @@ class Windows:
     epochs_gps_ns: Int64
     """(n,) the middles, `STEP_S` apart."""
     window_s: float
-    covered: Flags
+    covered: Bool
     """(n,) GNSS solutions without a break over the whole window."""
-    driving: Flags
+    driving: Bool
     """(n,) covered, and with enough speed for a course at both ends."""
     speed: Float64
     """(n,) m/s."""

@@ -18,12 +18,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2
 from roadscan.core.settings.smoothing import SmootherConfig
 from roadscan.navigation.inertial.kernels.kalman_states import Fixes
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, VehicleSensors
-
-Float64 = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

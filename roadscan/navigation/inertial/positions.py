@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.compute.flags import runs_of
 from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
 from roadscan.core.errors import CrsError, NavigationError
@@ -15,10 +15,6 @@ from roadscan.core.gpstime import NS_PER_S
 from roadscan.navigation.inertial.motion import ned_from_world
 from roadscan.navigation.inertial.readings import GnssSolutions
 from roadscan.navigation.inertial.records import FASTEST_M_PER_S, FEWEST_SPOILT, Kept, Repair, listed
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 HEIGHTS_M: Final = (-1000.0, 20_000.0)
 """Range of ellipsoidal heights of vehicles."""
@@ -86,7 +82,7 @@ def without_leaps(kept: Kept[GnssSolutions]) -> Kept[GnssSolutions]:
     return Kept(gnss, kept.records, repairs)
 
 
-def _left_out(gnss: GnssSolutions, records: Int64, bad: Flags, what: str) -> Repair:
+def _left_out(gnss: GnssSolutions, records: Int64, bad: Bool, what: str) -> Repair:
     placed = np.isfinite(gnss.position_world_m[:, 0])
     rows = np.flatnonzero(bad)
     if rows.size > max(FEWEST_SPOILT, AWAY_SHARE * placed.sum()):
@@ -100,7 +96,7 @@ def _left_out(gnss: GnssSolutions, records: Int64, bad: Flags, what: str) -> Rep
     return Repair("GNSS", what, records[rows], gnss.epochs_gps_ns[rows])
 
 
-def _blanked(gnss: GnssSolutions, bad: Flags) -> GnssSolutions:
+def _blanked(gnss: GnssSolutions, bad: Bool) -> GnssSolutions:
     return replace(
         gnss,
         position_world_m=np.where(bad[:, None], np.nan, gnss.position_world_m),
@@ -108,7 +104,7 @@ def _blanked(gnss: GnssSolutions, bad: Flags) -> GnssSolutions:
     )
 
 
-def _repeated(gnss: GnssSolutions) -> Flags:
+def _repeated(gnss: GnssSolutions) -> Bool:
     """Return positions (m,) identical to those of the epoch before, while the antenna moves.
 
     It moves where its velocity says so, or where it is afterwards farther away than a vehicle comes from rest.
@@ -134,10 +130,10 @@ def _repeated(gnss: GnssSolutions) -> Flags:
     return out
 
 
-def _away(gnss: GnssSolutions, records: Int64) -> Flags:
+def _away(gnss: GnssSolutions, records: Int64) -> Bool:
     """Return positions (m,) between a leap away and a leap back."""
     placed = np.flatnonzero(np.isfinite(gnss.position_world_m[:, 0]))
-    out: Flags = np.zeros(gnss.epochs_gps_ns.size, dtype=bool)
+    out: Bool = np.zeros(gnss.epochs_gps_ns.size, dtype=bool)
     if placed.size < 3:
         return out
     leap = _leaps(gnss, placed)

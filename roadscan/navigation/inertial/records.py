@@ -9,16 +9,12 @@ from dataclasses import dataclass
 from typing import Final, Generic, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.compute.flags import runs_of
 from roadscan.core.errors import NavigationError, TimeSystemError
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 LOST_SHARE: Final = 0.05
 """Largest share of samples that an IMU log may lack in gaps up to `SHORT_GAP_S`."""
@@ -269,7 +265,7 @@ def _check_share(counts: Int64, epochs: Int64, rows: Int64, gaps: Int64) -> None
         )
 
 
-def _saturation(epochs: Int64, values: Float64, rows: Int64) -> tuple[Flags, list[Repair]]:
+def _saturation(epochs: Int64, values: Float64, rows: Int64) -> tuple[Bool, list[Repair]]:
     """Find samples at the end of a sensor's scale: few are left out, many cause rejection."""
     repairs = []
     out = np.zeros(epochs.size, dtype=bool)
@@ -304,22 +300,22 @@ def _is_constant(column: Float64) -> bool:
     return bool(column.min() == column.max())
 
 
-def _whole(vectors: Float64) -> tuple[Float64, Flags]:
+def _whole(vectors: Float64) -> tuple[Float64, Bool]:
     """Return vectors (n, 3), all NaN where a part is not finite; flags where that was not so."""
     finite = np.isfinite(vectors)
-    whole: Flags = np.asarray(finite.all(axis=1))
-    missing: Flags = np.asarray(np.isnan(vectors).all(axis=1))
+    whole: Bool = np.asarray(finite.all(axis=1))
+    missing: Bool = np.asarray(np.isnan(vectors).all(axis=1))
     return np.where(whole[:, None], vectors, np.nan), ~whole & ~missing
 
 
-def _covariances(covariance: Float64) -> tuple[Float64, Flags]:
+def _covariances(covariance: Float64) -> tuple[Float64, Bool]:
     """Return covariances (n, 3, 3), NaN where invalid; flags of stated ones that are invalid."""
     stated = ~np.isnan(covariance).all(axis=(1, 2))
     finite = np.isfinite(covariance).all(axis=(1, 2))
     smallest = np.full(len(covariance), -1.0)
     smallest[finite] = np.linalg.eigvalsh(covariance[finite])[:, 0] if finite.any() else 0.0
     good = finite & (smallest > 0.0)
-    flawed: Flags = stated & ~good
+    flawed: Bool = stated & ~good
     return np.where(good[:, None, None], covariance, np.nan), flawed
 
 

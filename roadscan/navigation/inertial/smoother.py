@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.crs import LOCAL_WORLD
 from roadscan.core.errors import NavigationError
 from roadscan.core.frames import quaternion_from_rotation
@@ -46,10 +46,6 @@ from roadscan.navigation.inertial.readings import (
 )
 from roadscan.navigation.inertial.standing import standing
 from roadscan.navigation.inertial.timeline import Timeline, chosen, timeline
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 KINDS: Final = np.array(
     ["gnss position", "gnss velocity", "odometer", "non-holonomic", "zero velocity", "zero rotation"]

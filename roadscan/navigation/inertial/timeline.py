@@ -5,18 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.settings.smoothing import SmootherConfig
 from roadscan.navigation.inertial.kernels.kalman_states import Fixes, Nodes, Steps
 from roadscan.navigation.inertial.kernels.strapdown import increments
 from roadscan.navigation.inertial.noise import colour_restarts, fixes_of, imu_noise
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings, VehicleSensors
 from roadscan.navigation.inertial.standing import odometer_distance
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 _REPORT_NS = 1_000_000_000  # Interval of reported states.
 _ODOMETER_GAP_NS = 500_000_000  # Longest gap over which the odometer's distance is used.

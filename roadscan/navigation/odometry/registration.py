@@ -16,12 +16,10 @@ from typing import Any, Final, Self
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.extras import needed
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.settings.odometry import OdometryConfig
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 LIBRARY: Final = "kiss_icp.kiss_icp"
 WHAT: Final = "the section [navigation.odometry]"

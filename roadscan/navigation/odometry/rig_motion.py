@@ -8,13 +8,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.frames import ENU_FROM_NED
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2, ImuErrors
 from roadscan.core.settings.odometry import OdometryConfig
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 WINDOW_S: Final = 5.0
 """Length of the pieces over which accelerations are averaged and turns compared (s): shorter than a turn of a road."""

@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float64
 from roadscan.store.schema import table_schema
 
-Float64 = npt.NDArray[np.float64]
 Rows = tuple[str, pa.RecordBatch]
 
 

@@ -10,14 +10,13 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import ConfigError, NavigationError
 from roadscan.core.rig import Rig, Sensor
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings, VehicleSensors
 from roadscan.store.logs import LogRecord
 from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.store import Store
-
-Float64 = npt.NDArray[np.float64]
 
 ANTENNA_SIGMA_M = 0.01
 """1 σ of an antenna's lever arm where the rig file states none: that of a tape measure."""

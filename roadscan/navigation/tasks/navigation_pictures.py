@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.extras import can_draw
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.ids import of_run
@@ -25,8 +26,6 @@ from roadscan.store.logs import LogRecord, read_log_records
 from roadscan.store.manifest import Manifest
 from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.store import Store
-
-Float64 = npt.NDArray[np.float64]
 
 _FOLDER: Final = "products/navigation"
 _VALUE: Final = ("value", "sigma")

@@ -6,18 +6,15 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.settings.calibration import CalibrationSettings
 from roadscan.navigation.tasks.trajectories import TrajectorySource
 from roadscan.store.logs import LogRecord
 from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.store import Store
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _SIGMAS: Final = (
     "sigma_north_m", "sigma_east_m", "sigma_down_m", "sigma_roll_deg", "sigma_pitch_deg", "sigma_heading_deg",

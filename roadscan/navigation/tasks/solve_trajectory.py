@@ -1,4 +1,10 @@
-"""Computes the trajectory of a run from its GNSS, IMU and odometer: load, check, smooth, yield rows."""
+"""Computes the trajectory of a run from its GNSS, IMU and odometer: load, check, smooth, yield rows.
+
+Checks whether a smoothed trajectory follows the measurements that it was computed from.
+
+Some wrong inputs cannot be detected by comparing motions beforehand (a horizontal gyroscope with the wrong sign on an
+even road). They show in the result: the smoother has to trust either the IMU or GNSS, and they disagree.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +15,17 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
+from roadscan.core.errors import NavigationError
+from roadscan.core.frames import rotation_from_quaternion
+from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.core.ids import of_run
 from roadscan.core.survey import Survey
 from roadscan.ingest.clocks.correction import ClockCorrection
 from roadscan.navigation.inertial.adaptive import solve_adaptively
 from roadscan.navigation.inertial.checks import prepared
-from roadscan.navigation.inertial.outcome import check_outcome, warnings_of
-from roadscan.navigation.inertial.readings import GnssSolutions, Innovations, Solution
+from roadscan.navigation.inertial.motion import ned_from_world
+from roadscan.navigation.inertial.readings import GnssSolutions, Innovations, Solution, VehicleSensors
 from roadscan.navigation.tasks.clock_tables import load_clocks
 from roadscan.navigation.tasks.computed_trajectory import Computed, Rows, sigma_figures, table_rows, trajectory_rows
 from roadscan.navigation.tasks.navigation_logs import (
@@ -191,3 +201,160 @@ def _summary(solution: Solution, gnss: GnssSolutions) -> dict[str, Any]:
         figures["updates"] = int(found.weight.size)
         figures["outliers"] = int((found.weight < 1).sum())
     return figures
+
+
+FAR_SIGMAS: Final = 6.0
+"""A position this many σ from the trajectory disagrees with it."""
+LEAST_SIGMA_M: Final = 0.02
+"""Least σ of a GNSS position in this check: receivers often state too small ones."""
+FAR_SHARE: Final = 0.05
+"""Largest share of positions that may disagree."""
+CONTRADICTED: Final = 1 / 3
+"""Largest share of another kind of measurement that may be outliers where positions disagree."""
+_DOUBTFUL: Final = 0.1
+"""Share of outliers above which a kind of measurement contradicts the trajectory."""
+_LARGE: Final = 3.0
+"""RMS of innovations over their σ above which it does."""
+_LEAST: Final = 20  # With fewer measurements of a kind nothing is reported.
+_CAUSE: Final = (
+    "check axes, signs and units of the IMU (its horizontal axes above all), its errors in the rig file, clocks, the "
+    "antenna's lever arm and the σ of the GNSS log"
+)
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Antenna position of the trajectory less that of GNSS."""
+
+    records: Int64
+    """(k,) rows of the GNSS log."""
+    ned_m: Float64
+    """(k, 3)."""
+    sigmas: Float64
+    """(k,) length over its σ."""
+
+
+def residuals_of(solution: Solution, gnss: GnssSolutions, vehicle: VehicleSensors) -> Residuals:
+    """Return residuals of the GNSS positions within the trajectory's pieces that state a covariance."""
+    epochs = gnss.epochs_gps_ns
+    first, last = int(solution.epochs_gps_ns[0]), int(solution.epochs_gps_ns[-1])
+    pieces = solution.pieces or ((first, last),)
+    inside = np.any([(epochs >= a) & (epochs <= b) for a, b in pieces], axis=0)
+    sigma = np.sqrt(np.trace(gnss.covariance_ned_m2, axis1=1, axis2=2))
+    rows = np.flatnonzero(inside & np.isfinite(gnss.position_world_m[:, 0]) & np.isfinite(sigma))
+    arm = vehicle.antenna_lever_arm_body_m
+    found = solution.states.get("antenna_lever_arm_body_m")
+    if found is not None and len(found[0]):
+        arm = found[0][-1]
+    antenna = solution.position_world_m + rotation_from_quaternion(solution.quaternion_world_from_body) @ arm
+    origin = antenna[0]
+    known, wanted = ((e - first).astype(np.float64) / NS_PER_S for e in (solution.epochs_gps_ns, epochs[rows]))
+    at = np.stack([np.interp(wanted, known, antenna[:, k] - origin[k]) for k in range(3)], axis=-1)
+    ned = (at - (gnss.position_world_m[rows] - origin)) @ ned_from_world(solution.world, origin).T
+    own = np.interp(wanted, known, np.sqrt(np.einsum("nii->n", solution.covariance_position_ned_m2)))
+    stated = np.maximum(sigma[rows], LEAST_SIGMA_M)
+    return Residuals(rows, ned, np.linalg.norm(ned, axis=1) / np.hypot(stated, own))
+
+
+def check_outcome(solution: Solution, gnss: GnssSolutions, vehicle: VehicleSensors) -> list[str]:
+    """Reject a trajectory that its measurements contradict; return notes on one that is suspect.
+
+    Multipath makes GNSS positions disagree, and them alone. Where an IMU is wrong, velocities, odometer and the
+    constraints of a vehicle disagree, too.
+
+    Returns
+    -------
+    What the user should know; empty where measurements and trajectory agree.
+
+    Raises
+    ------
+    NavigationError
+        where positions and another kind of measurement disagree with it.
+    """
+    doubted = _doubted(solution)
+    positions = doubted.pop("gnss position", 0.0)
+    most = max(doubted.values(), default=0.0)
+    found = residuals_of(solution, gnss, vehicle)
+    far = found.sigmas > FAR_SIGMAS
+    is_far = found.sigmas.size >= _LEAST and far.mean() > FAR_SHARE
+    if not (is_far and most > CONTRADICTED) and not min(positions, most) > 1.2 * CONTRADICTED:
+        others = sum(share > _DOUBTFUL for share in doubted.values())
+        if positions > 1.5 * _DOUBTFUL and others >= 2:
+            said = _told(positions, doubted)
+            return [f"measurements of several kinds disagree with the trajectory ({said} are outliers): {_CAUSE}"]
+        return []
+    size = np.linalg.norm(found.ned_m, axis=1)
+    worst = int(np.argmax(size))
+    record = int(found.records[worst])
+    raise NavigationError(
+        f"the measurements contradict the trajectory: {_told(positions, doubted)} count as outliers, and "
+        f"{far.mean():.0%} of the GNSS positions lie more than {FAR_SIGMAS:g} σ away, the farthest, record {record} "
+        f"({iso_from_gps_ns(int(gnss.epochs_gps_ns[record]))}), by {size[worst]:.2f} m",
+        expected=f"less than a third of each kind, and at most {FAR_SHARE:.0%} so far away",
+        change=_CAUSE,
+        record=record,
+    )
+
+
+@dataclass(frozen=True)
+class KindFigures:
+    """Statistics of the updates of a kind."""
+
+    kind: str
+    updates: int
+    outliers: float
+    """Share that is down-weighted."""
+    innovation: float
+    """RMS of the innovations over their predicted σ."""
+
+
+def figures_of(solution: Solution) -> list[KindFigures]:
+    """Return statistics of the updates by kind, those of GNSS also together as 'gnss'."""
+    found = solution.innovations
+    if found is None:
+        return []
+    rows = {str(kind): found.kind == kind for kind in np.unique(found.kind)}
+    rows = {"gnss": np.char.startswith(found.kind.astype(str), "gnss"), **rows}
+    return [
+        KindFigures(
+            kind,
+            int(own.sum()),
+            float((found.weight[own] < 1.0).mean()),
+            float(np.sqrt(found.normalised[own].mean())),
+        )
+        for kind, own in rows.items()
+        if own.any()
+    ]
+
+
+def warnings_of(solution: Solution) -> list[str]:
+    """Describe the kinds of measurement with many outliers, or with large innovations.
+
+    Both a poor receiver and a wrong trajectory cause this: :func:`check_outcome` distinguishes them.
+    """
+    said = []
+    for one in figures_of(solution):
+        if one.updates < _LEAST or one.kind.startswith(("gnss ", "zero")):
+            continue
+        found = []
+        if one.outliers > _DOUBTFUL:
+            found.append(f"{one.outliers:.0%} of {one.updates:,} updates are outliers (at most {_DOUBTFUL:.0%})")
+        if one.innovation > _LARGE:
+            found.append(f"innovations are {one.innovation:.1f} σ (RMS; at most {_LARGE:g})")
+        if found:
+            said.append(f"'{one.kind}': {' and '.join(found)}")
+    return [f"measurements disagree with the trajectory: {'; '.join(said)}: {_CAUSE}"] if said else []
+
+
+def _doubted(solution: Solution) -> dict[str, float]:
+    """Return the share of down-weighted measurements of each kind; kinds with too few are left out."""
+    found = solution.innovations
+    if found is None:
+        return {}
+    kinds = [kind for kind in np.unique(found.kind).tolist() if not kind.startswith("zero")]
+    return {k: float((found.weight[found.kind == k] < 1.0).mean()) for k in kinds if (found.kind == k).sum() >= _LEAST}
+
+
+def _told(positions: float, others: dict[str, float]) -> str:
+    shares = {"gnss position": positions} | others
+    return ", ".join(f"{share:.0%} of '{kind}'" for kind, share in shares.items())

@@ -9,16 +9,14 @@ from pathlib import PurePosixPath
 from typing import Self
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Int64
 from roadscan.core.gpstime import gps_ns_from_utc
 from roadscan.core.ids import of_run
 from roadscan.navigation.tasks.clock_tables import load_clocks
 from roadscan.store.logs import LogRecord
 from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.store import Store
-
-Int64 = npt.NDArray[np.int64]
 
 _COLUMNS = ["epoch_gps_ns", "file", "frame", "width_px", "height_px"]
 

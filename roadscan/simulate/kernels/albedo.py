@@ -6,13 +6,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float32, Float64
 from roadscan.simulate.kernels.chance import mixed
 from roadscan.simulate.kernels.options import compiled, inlined
-
-Float32 = npt.NDArray[np.float32]
-Float64 = npt.NDArray[np.float64]
 
 NODE_SPREAD = 0.3697
 """Standard deviation of noise between nodes of even random numbers from −1 to 1: the mean over a cell of the cubic

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-import numpy.typing as npt
-
+from roadscan.compute.array_types import Float64
 from roadscan.simulate.kernels.options import inlined, inner
 from roadscan.simulate.kernels.road import STATION, RoadArrays, defect_depth, node_at, project, worn_height
-
-Float64 = npt.NDArray[np.float64]
 
 ROOT_TOLERANCE_M = 1e-8
 """Largest distance of a beam's end from the surface (m), along the height."""

@@ -10,8 +10,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float32, Float64, Int32, UInt8
 from roadscan.simulate.kernels.beams import along_beam, clearance
 from roadscan.simulate.kernels.options import compiled, inner
 from roadscan.simulate.kernels.road import (
@@ -34,11 +34,6 @@ from roadscan.simulate.kernels.road import (
     smooth_step,
     worn_height,
 )
-
-Float32 = npt.NDArray[np.float32]
-Float64 = npt.NDArray[np.float64]
-Int32 = npt.NDArray[np.int32]
-UInt8 = npt.NDArray[np.uint8]
 
 CELL_M = 1.0
 """Side of a cell of the map (m)."""

@@ -6,8 +6,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float32, Float64, Int32, Int64, UInt8, UInt16
 from roadscan.simulate.kernels.beams import ROOT_TOLERANCE_M, along_beam, clearance, into_defect, turn_to_road
 from roadscan.simulate.kernels.chance import mixed
 from roadscan.simulate.kernels.options import compiled, inlined, inner
@@ -25,14 +25,6 @@ from roadscan.simulate.kernels.road import (
     worn_height,
 )
 from roadscan.simulate.kernels.things import meet, shade
-
-Float32 = npt.NDArray[np.float32]
-Float64 = npt.NDArray[np.float64]
-Int32 = npt.NDArray[np.int32]
-Int64 = npt.NDArray[np.int64]
-UInt16 = npt.NDArray[np.uint16]
-UInt8 = npt.NDArray[np.uint8]
-Flags = npt.NDArray[np.bool_]
 
 WALL_STEP_M = 0.0005
 """Step along a line of sight out of a defect (m)."""
@@ -88,7 +80,7 @@ class Planes(NamedTuple):
     """(p, 3, 9) station, offset, height, see :func:`road_beam`."""
     in_map: Float64
     """(p, 3, 6) easting, northing, height, see :func:`map_beam`."""
-    is_bent: Flags
+    is_bent: Bool
     """(p,) whether the road bends so much here that `in_road` is only a first approximation."""
     middle_m: float
     """Middle range."""

@@ -6,8 +6,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64, Int32, Int64
 from roadscan.simulate.kernels.beams import along_beam, through
 from roadscan.simulate.kernels.chance import mixed
 from roadscan.simulate.kernels.ground import CELL_M, TILE_CELLS, TILE_M, Cells, first_ground, into_hole
@@ -44,11 +44,6 @@ from roadscan.simulate.kernels.things import (
     normal,
     shade,
 )
-
-Float64 = npt.NDArray[np.float64]
-Int32 = npt.NDArray[np.int32]
-Int64 = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 NOTHING, ROAD, LOST = -1, -2, -3
 """Results of a ray that meets no body: nothing within reach; the road; the road's underside or edge."""
@@ -149,7 +144,7 @@ class Found(NamedTuple):
     """(g, m) 0: the road, −1: nothing."""
     body: Int32
     """(g, m) the body met, numbers of moving ones follow on those of the world; −1: none."""
-    is_mixed: Flags
+    is_mixed: Bool
     """(g, m) the range is a mixture of several things', or another's than that in the ray's middle."""
 
 

@@ -10,15 +10,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float32, Float64, Int64
 from roadscan.simulate.kernels.chance import mixed
 from roadscan.simulate.kernels.options import compiled, inlined, inner
-
-Float64 = npt.NDArray[np.float64]
-Float32 = npt.NDArray[np.float32]
-Int64 = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 NODE_STEP_M = 0.5
 """Distance from node to node of the reference line."""
@@ -500,7 +495,7 @@ def heights_along(road: RoadArrays, station: Float64, offset: Float64, out: Floa
 
 
 @compiled
-def find_paint(road: RoadArrays, station: Float64, offset: Float64, out: Flags) -> None:
+def find_paint(road: RoadArrays, station: Float64, offset: Float64, out: Bool) -> None:
     """Write whether places are on paint that is not worn off: lines, stop bars, zebra crossings. All arrays (n,)."""
     nodes, lines, items = road.nodes, road.lines, road.items
     for p in range(station.size):

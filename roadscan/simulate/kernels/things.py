@@ -8,12 +8,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.simulate.kernels.chance import mixed
 from roadscan.simulate.kernels.options import inlined, inner
-
-Float64 = npt.NDArray[np.float64]
 
 BOX, CYLINDER, ELLIPSOID, WALL, DISC, TRIANGLE, OCTAGON, DIAMOND = 0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0
 """Kinds of bodies. Walls, discs and the four after them are thin, upright, and visible from both sides."""

@@ -6,20 +6,14 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float32, Float64, Int32, Int64
 from roadscan.simulate.caster import SLOT_NS, World
 from roadscan.simulate.kernels import albedo as kernels
 from roadscan.simulate.kernels import things as body
 from roadscan.simulate.kernels.rays import Movers
 from roadscan.simulate.noise import stream
 from roadscan.simulate.scene.albedo import Albedo
-
-Float32 = npt.NDArray[np.float32]
-Float64 = npt.NDArray[np.float64]
-Int32 = npt.NDArray[np.int32]
-Int64 = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 _LEAVES: Final = frozenset({"tree", "planting", "hedge"})  # kinds of objects with leaves
 _ROUGH: Final = frozenset({"facade", "wall", "fence", "gate", "box", "steps", "planter", "balcony", "shelter"})

@@ -29,8 +29,6 @@ from roadscan.simulate.sensors import gnss, imu, lidar, livox
 from roadscan.simulate.sensors.clock import SensorClock
 from roadscan.simulate.sensors.lidar import BODY_FROM_AXES
 
-Float64 = npt.NDArray[np.float64]
-
 CLOUDS: Final = "/lidar/points"
 IMU: Final = "/imu/data"
 POSITIONS: Final = "/gnss/fix"

@@ -14,6 +14,7 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 from scipy.spatial.transform import Rotation
 
+from roadscan.compute.array_types import Float32, Float64, Int64
 from roadscan.core.extras import cv2
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.noise import stream
@@ -21,10 +22,6 @@ from roadscan.simulate.scene import Camera, Scene
 from roadscan.simulate.scene.camera import PictureFaults
 from roadscan.simulate.sensors.clock import SensorClock
 from roadscan.simulate.sensors.picture import EYE, Studio, picture
-
-Float32 = npt.NDArray[np.float32]
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 STAMPS_FILE: Final = "stamps.csv"
 _STAMPS: Final = pa.schema([("file", pa.string()), ("time_ns", pa.int64())])

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Int64
 from roadscan.core.errors import ConfigError
 from roadscan.core.gpstime import (
     GPS_EPOCH_UNIX_S,
@@ -19,8 +19,6 @@ from roadscan.core.gpstime import (
     utc_from_gps_ns,
 )
 from roadscan.simulate.scene import ClockError, Scene
-
-Int64 = npt.NDArray[np.int64]
 
 _NOTHING_S: Final = 1e-9
 """Offset that stands for none where the survey file has to state one (s)."""

@@ -8,15 +8,13 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float32, Float64
 from roadscan.core.errors import ConfigError
 from roadscan.core.extras import cv2
 from roadscan.simulate.caster import Hits, World
 from roadscan.simulate.kernels import things as body
 from roadscan.simulate.scene.roadside import Sign
 from roadscan.simulate.things import described_signs
-
-Float32 = npt.NDArray[np.float32]
-Float64 = npt.NDArray[np.float64]
 
 SKY: Final = np.array([0.86, 0.95, 1.06], np.float32)  # shares of red, green and blue
 SIGN_COLOURS: Final = {

@@ -7,17 +7,14 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.csv as pa_csv
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.sensors.clock import SensorClock
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 CHUNK: Final = 65_536  # records of a chunk
 _GRID_NS: Final = 20_000_000  # step of the path's table

@@ -11,15 +11,12 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, utc_from_gps_ns
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.noise import GaussMarkov, stream
 from roadscan.simulate.scene import Mount, MountError, Scene
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 FIXED: Final = 1  # quality of a fixed solution, as RTKLIB numbers it
 FLOAT: Final = 2

@@ -8,20 +8,17 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.csv as pa_csv
 from scipy.spatial.transform import Rotation
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.imu import IMU_GRADES, STANDARD_GRAVITY_M_PER_S2, ImuErrors
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.noise import GaussMarkov, stream
 from roadscan.simulate.scene import Mount, Scene
 from roadscan.simulate.sensors.clock import SensorClock
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 CHUNK: Final = 16_384  # samples of a chunk
 AT_BODY: Final = Mount(lever_arm_body_m=(0.0, 0.0, 0.0))

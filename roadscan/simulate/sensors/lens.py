@@ -8,10 +8,9 @@ from typing import Final, Self
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import ConfigError
 from roadscan.simulate.scene import Camera
-
-Float64 = npt.NDArray[np.float64]
 
 _STEPS: Final = 30  # most steps of Newton's method
 _WITHIN: Final = 1e-10  # error at which they end

@@ -14,15 +14,12 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.simulate.caster import Hits, Pattern, World, ray_key, steps_within
 from roadscan.simulate.drive import RUN_UP_S, Drive
 from roadscan.simulate.lidar_model import LidarModel, ModelErrors, lidar_model
 from roadscan.simulate.noise import stream
 from roadscan.simulate.scene import Scene
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 INTERVALS: Final = 4
 """Intervals of a block of cycles (an HDL-32E's packet), within which the sensor moves evenly."""
@@ -176,7 +173,7 @@ def _blind(scene: Scene, rng: np.random.Generator, found: Hits) -> None:
     found.intensity[lost] = rng.uniform(3.0, 40.0, np.count_nonzero(lost)) / REFLECTIVITY
 
 
-def _lost_in_the_dark(scene: Scene, rng: np.random.Generator, exact: Float64, intensity: Float64) -> Flags:
+def _lost_in_the_dark(scene: Scene, rng: np.random.Generator, exact: Float64, intensity: Float64) -> Bool:
     """Return which firings (p, c, n) are lost because too little light comes back."""
     signal = np.nan_to_num(intensity.reshape(exact.shape)) / 10.0 * ((scene.lidar.dark_m or np.inf) / exact) ** 2
     return np.asarray(rng.random(exact.shape) < np.exp(-signal))

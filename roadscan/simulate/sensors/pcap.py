@@ -11,13 +11,12 @@ from typing import Final, Self
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Int64
 from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, TimeSystem, leap_seconds_at_gps
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.sensors.clock import SensorClock
 from roadscan.simulate.sensors.lidar import Packets
-
-Int64 = npt.NDArray[np.int64]
 
 DATA_BYTES: Final = 1_206  # bytes of a data packet
 POSITION_BYTES: Final = 512  # bytes of a position packet

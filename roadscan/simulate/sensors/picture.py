@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import maximum_filter, minimum_filter
 
+from roadscan.compute.array_types import Bool, Float32, Float64, Int32, Int64
 from roadscan.simulate.caster import Hits, Pattern, World, ray_key
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.noise import stream
@@ -24,11 +25,6 @@ from roadscan.simulate.sensors.albedo import Seen as SeenPlaces
 from roadscan.simulate.sensors.colours import SKY, Tints
 from roadscan.simulate.sensors.lens import Lens, Sphere
 
-Float32 = npt.NDArray[np.float32]
-Float64 = npt.NDArray[np.float64]
-Int32 = npt.NDArray[np.int32]
-Int64 = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 FloatArray = TypeVar("FloatArray", Float32, Float64)
 
 EYE: Final = np.eye(3)
@@ -116,7 +112,7 @@ class _Seen:
     """(n,) intensity; NaN: nothing, or glass."""
     object_id: Int32
     """(n,) 0: the road, −1: nothing."""
-    is_glass: Flags
+    is_glass: Bool
     """(n,)"""
     row_px: Float32
     """(n,) row of the picture."""
@@ -265,7 +261,7 @@ class _Eye:
             found.append(part[hits.object_id[0] >= 0])
         return np.concatenate([np.zeros(0, np.int64), *found])
 
-    def _thinned_shadows(self, seen: _Seen, is_sunny: Flags, shape: tuple[int, int]) -> Int64:
+    def _thinned_shadows(self, seen: _Seen, is_sunny: Bool, shape: tuple[int, int]) -> Int64:
         """Return the pixels from which something hides the sun, casting where it may change from pixel to pixel."""
         row, column = np.indices(shape)
         is_first = (row % 2 == 0) & (column % 2 == 0)
@@ -337,7 +333,7 @@ class _Shutter:
         return np.asarray(first + np.rint(share * (last - first)).astype(np.int64))
 
 
-def _around_states(is_sunny: Flags, shadow: Int64, shape: tuple[int, int]) -> npt.NDArray[np.int8]:
+def _around_states(is_sunny: Bool, shadow: Int64, shape: tuple[int, int]) -> npt.NDArray[np.int8]:
     """Return whether all that faces the sun in a pixel (h, w) and those around it is lit, or is dark; else mixed."""
     dark = np.zeros(is_sunny.size, np.bool_)
     dark[shadow] = True

@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from scipy.special import ndtri
 
+from roadscan.compute.array_types import Float64, Int32, Int64
 from roadscan.core.gpstime import TimeSystem
 from roadscan.simulate.caster import SLOT_NS
 from roadscan.simulate.drive import Drive
@@ -41,10 +42,6 @@ from roadscan.simulate.sensors.clock import SensorClock
 from roadscan.simulate.sensors.encoder import WheelEncoder
 from roadscan.simulate.surface import Surface
 from roadscan.simulate.things import Object, mover_bodies, moving_objects
-
-Float64 = npt.NDArray[np.float64]
-Int32 = npt.NDArray[np.int32]
-Int64 = npt.NDArray[np.int64]
 
 BLOCK_PROFILES: Final = 512
 """Profiles measured together, and rows of a Parquet row group."""

@@ -19,21 +19,16 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from roadscan.compute.array_types import Float64, Int64, UInt8, UInt16
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.simulate.caster import Hits, Pattern, World, ray_key, steps_within
 from roadscan.simulate.drive import RUN_UP_S, Drive
 from roadscan.simulate.noise import stream
 from roadscan.simulate.scene import Scene, Sick
 from roadscan.simulate.sensors.clock import SensorClock
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-UInt8 = npt.NDArray[np.uint8]
-UInt16 = npt.NDArray[np.uint16]
 
 TURN_NS: Final = round(NS_PER_S / 75)
 """Duration of one turn of the mirror (ns)."""

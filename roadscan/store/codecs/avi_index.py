@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import BinaryIO, Final
 
 import numpy as np
-import numpy.typing as npt
 
-Bool = npt.NDArray[np.bool_]
+from roadscan.compute.array_types import Bool
 
 _ENTRY: Final = np.dtype([("id", "S4"), ("flags", "<u4"), ("offset", "<u4"), ("length", "<u4")])
 _CHUNK: Final = struct.Struct("<4sI")

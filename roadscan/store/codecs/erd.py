@@ -21,11 +21,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import FormatError
-
-Floats = npt.NDArray[np.float64]
 
 MAGIC = "ERDFILEV2.00"
 _TEXT = 5  # format number of text data
@@ -48,7 +46,7 @@ class ErdFile:
     """Channels (SHORTNAM); numbers from 1 where they are not stated."""
     units: tuple[str, ...]
     """Units of channels (UNITSNAM); empty where they are not stated."""
-    values: Floats
+    values: Float64
     """(channels, samples)."""
     title: str
     """TITLE of the file."""
@@ -88,7 +86,7 @@ def parse_erd(text: str) -> ErdFile:
     )
 
 
-def erd_text(step_m: float, start_m: float, names: Sequence[str], heights_m: Floats, title: str = "") -> str:
+def erd_text(step_m: float, start_m: float, names: Sequence[str], heights_m: Float64, title: str = "") -> str:
     """Return the text of an ERD file of profiles.
 
     Parameters
@@ -144,7 +142,7 @@ def _fields(line: str, channels: int) -> tuple[str, ...]:
     return tuple(line[_WIDTH * k : _WIDTH * (k + 1)].strip() for k in range(channels))
 
 
-def _numbers(lines: Sequence[str], first_record: int, channels: int, samples: int) -> Floats:
+def _numbers(lines: Sequence[str], first_record: int, channels: int, samples: int) -> Float64:
     """Return the data's numbers as (channels, samples)."""
     read: list[float] = []
     for record, line in enumerate(lines, first_record):

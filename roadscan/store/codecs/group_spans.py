@@ -17,7 +17,7 @@ from typing import Any, Self, overload
 import numpy as np
 import numpy.typing as npt
 
-Int64 = npt.NDArray[np.int64]
+from roadscan.compute.array_types import Int64
 
 
 class GroupSpans(Sequence[tuple[int, int]]):

@@ -14,9 +14,8 @@ from typing import BinaryIO, Final, Self
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Int64
 from roadscan.store.codecs.child import Child, ChildError
-
-Int64 = npt.NDArray[np.int64]
 
 _REQUEST: Final = struct.Struct("<qq")
 _LONGEST_S: Final = 120.0  # longest time for one request (s)

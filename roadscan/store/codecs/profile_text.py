@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import FormatError
-
-Floats = npt.NDArray[np.float64]
 
 _MISSING = {"", "nan", "na", "n/a", "null", "none", "-"}
 _UNIT = re.compile(r"[(\[]\s*([^)\]]+?)\s*[)\]]\s*$|_(mm|cm|km|m|ft|in|mil)$", re.IGNORECASE)
@@ -30,7 +29,7 @@ class TextColumns:
     """Names of the columns; numbers from 1 where there are none."""
     units: tuple[str, ...]
     """Units that the names state, as `height_mm` and `Depth (mm)` do; empty where they do not."""
-    values: Floats
+    values: Float64
     """(columns, samples), NaN where nothing was measured."""
     records: npt.NDArray[np.int64]
     """(samples,) line of each sample, from 1."""

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float32
 from roadscan.compute.kernel_options import read_only
 from roadscan.store.readings.kernels.firings import SLOTS, BeamTable, Packed, Turned, positions
 from roadscan.store.schema import TableSchema, table_schema
@@ -38,7 +39,6 @@ _CENTIDEG: Final = 0.01
 """What an azimuth counts (°)."""
 
 Numbers = npt.NDArray[Any]
-Float32 = npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float32, Float64, Int64
 from roadscan.store.codecs.parquet.number_file import NumberFile
 from roadscan.store.codecs.parquet.page_file import DamageError
 from roadscan.store.readings.group_reader import Footer, GroupReader
@@ -35,9 +36,6 @@ _PACKED_KINDS: Final[dict[str, np.dtype[Any]]] = {
 }  # fmt: skip
 
 Array = npt.NDArray[Any]
-Int64 = npt.NDArray[np.int64]
-Float32 = npt.NDArray[np.float32]
-Float64 = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

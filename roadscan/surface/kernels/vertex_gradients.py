@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from roadscan.compute.kernel_options import kernel
-from roadscan.surface.kernels.vertex_rings import MOST_RINGS, grow, is_narrow, whitening
+from roadscan.surface.kernels.vertex_neighbourhoods import MOST_RINGS, grow, is_narrow, whitening
 
 FITTED, PLANE, LEVEL = 0, 1, 2
 """Sources of a gradient: the polynomial asked for, a plane, or nothing."""

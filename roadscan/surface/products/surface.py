@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Final, Literal, cast
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
+from roadscan.compute.array_types import Float32
 from roadscan.core.strict import Strict
 from roadscan.store.codecs.cog import Band, dense_image, write_cog
 from roadscan.store.codecs.tiff import check_cog
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from rasterio.transform import Affine
 
 SurfaceBand = Literal["height", "raw_height", "origin", "intensity"]
-Float32 = npt.NDArray[np.float32]
 
 HEIGHT_STEP: Final = 2.0**-15
 """Heights are whole multiples of this, in the unit of the map's heights, as in `geotiff`."""

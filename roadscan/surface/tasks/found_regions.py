@@ -33,9 +33,8 @@ from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.surface.coarse import CoarseSettings, Stretch, coarse_model
-from roadscan.surface.region_settings import RegionSettings
 from roadscan.surface.regions import Region, find_regions
-from roadscan.surface.settings import SurfaceConfig
+from roadscan.surface.settings import RegionSettings, SurfaceConfig
 from roadscan.surface.tasks.surface_regions import Regions
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.geo_table import read_geo_table, write_geo_table

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.ids import TileId
 from roadscan.core.strict import Strict
 from roadscan.store.codecs.cog import Band
@@ -33,8 +34,6 @@ from roadscan.tiles.products.sheets import (
     unknown_output,
     write_index,
 )
-
-Float64 = npt.NDArray[np.float64]
 
 _STEM: Final = "hillshade"
 _PICTURE: Final = "hillshade.png"

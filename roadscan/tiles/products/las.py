@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final, cast
 
 import numpy as np
-import numpy.typing as npt
 from pydantic import Field
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.errors import ConfigError, StoreError
 from roadscan.core.gpstime import ADJUSTED_OFFSET_S, NS_PER_S
 from roadscan.core.grid import TileGrid
@@ -23,8 +23,6 @@ from roadscan.tiles.products.las_axes import Axes, axis, rounding_errors, set_co
 if TYPE_CHECKING:
     import laspy
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _SCAN_ANGLE_STEP_DEG: Final = 0.006  # Step of the scan angle in LAS 1.4.
 

@@ -7,9 +7,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.store.codecs.mesh import Mesh
-
-Float64 = npt.NDArray[np.float64]
 
 
 def mesh_of(easting_m: Float64, northing_m: Float64, height_m: Float64, colour: npt.NDArray[np.uint8]) -> Mesh:

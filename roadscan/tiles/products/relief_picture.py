@@ -11,10 +11,8 @@ from typing import Any, Final, Self
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.store.codecs.gdal import raster_settings, without_place_warning
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 

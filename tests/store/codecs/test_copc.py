@@ -12,7 +12,7 @@ import pytest
 
 from roadscan.core.crs import MapFrame
 from roadscan.core.errors import StoreError
-from roadscan.site.octree import Cube, NodeCutter
+from roadscan.site.cloud_file import Cube, NodeCutter
 from roadscan.store.codecs import copc
 from roadscan.store.codecs.copc import CopcWriter
 from roadscan.store.codecs.las import Layout

@@ -13,8 +13,8 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
 from roadscan.core.errors import StoreError
+from roadscan.store.readings.byte_source import ReadAhead
 from roadscan.store.readings.profiles import ProfileReader
-from roadscan.store.readings.read_ahead import ReadAhead
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.store.writer import write_parquet

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from roadscan.core.errors import ConfigError, StoreError
-from roadscan.tiles.decimate import decimate
 from roadscan.tiles.product import Tile, is_default, product_named
 from roadscan.tiles.products.las import Las, LasOptions
-from roadscan.tiles.products.model_las import ModelLas, ModelLasFine, ModelLasFineOptions, ModelLasOptions
+from roadscan.tiles.products.model_las import ModelLas, ModelLasFine, ModelLasFineOptions, ModelLasOptions, decimate
 
 CELL_M = 0.25
 OPTIONS = ModelLasOptions(spacing_m=1.0)

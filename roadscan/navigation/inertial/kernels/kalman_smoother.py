@@ -18,13 +18,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.compute.kernel_options import inlined, inner, kernel
 from roadscan.navigation.inertial.kernels.kalman_states import NAVIGATION, cross_rows, decays, level_axes
 from roadscan.navigation.inertial.kernels.strapdown import EARTH_RATE_RAD_PER_S, exponential, matrix, product, unit
-
-Float64 = npt.NDArray[np.float64]
 
 
 @kernel

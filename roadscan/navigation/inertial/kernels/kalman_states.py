@@ -11,11 +11,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.kernel_options import inlined
 from roadscan.navigation.inertial.kernels.strapdown import geodetic
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 POSITION, VELOCITY, ATTITUDE, GYRO_BIAS, ACCEL_BIAS = 0, 3, 6, 9, 12  # First columns of these states, three each.
 GYRO_SCALE, ACCEL_SCALE = 15, 18

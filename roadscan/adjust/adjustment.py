@@ -28,12 +28,9 @@ from roadscan.adjust.solver_settings import AdjustmentSettings
 from roadscan.adjust.sparse_normal import Rows
 from roadscan.adjust.unknowns import HEIGHT_ALONE, ControlPoints, Unknowns, directions_of
 from roadscan.adjust.weights import Groups
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.pictures.lens import PARAMETERS
 from roadscan.poses.trajectory import Corrections
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 _DOWN: Final = COMPONENTS.index("down_m")
 _AT_ONCE: Final = 200

@@ -24,13 +24,9 @@ from typing import Final, Self
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int32, Int64, UInt8
 from roadscan.pictures.camera_changes import COLUMNS
 from roadscan.poses.mounting_change import Seat
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Int32 = npt.NDArray[np.int32]
-UInt8 = npt.NDArray[np.uint8]
 
 KINDS: Final = (
     "height_tie", "shift_tie", "plane_tie", "control_height", "control_position", "head_tie", "hand_tie",

@@ -23,12 +23,10 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.observations import COMPONENTS
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.flags import runs_of
 from roadscan.core.errors import ConfigError
 from roadscan.core.gpstime import NS_PER_S
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _OUTAGE: Final = float(np.sqrt(2.0))
 """Factor of σ above the usual one that marks an outage: at least half of its variance is not of the usual kind."""

@@ -25,11 +25,9 @@ from roadscan.adjust.process import (
     stretches,
 )
 from roadscan.adjust.sparse_normal import Rows
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.errors import ConfigError
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _SIZE = len(COMPONENTS)
 _MOUNT_SIZE = len(MOUNTED)

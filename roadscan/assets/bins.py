@@ -9,9 +9,7 @@ import numpy.typing as npt
 
 from roadscan.assets.kernels.buckets import by_number, raster_cells
 from roadscan.assets.kernels.columns import distinct
-
-Int64 = npt.NDArray[np.int64]
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64, Int64
 
 
 def in_bins(number: npt.NDArray[np.integer[Any]], bins: int) -> tuple[Int64, Int64]:

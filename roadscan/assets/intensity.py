@@ -26,14 +26,13 @@ from roadscan.assets.kernels.beams import log_gains, meet_ground
 from roadscan.assets.quantiles import weighted_quantile
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import GroundModel, Scene
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.kernel_options import read_only
 from roadscan.compute.robust import scatter_about
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 RANGE_NODES_M: Final = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.5, 8.0, 10.0, 13.0, 17.0, 23.0, 32.0, 45.0, 64.0, 90.0])
 """Ranges of the gain curve (m): a quarter to a third apart, as the return falls with a power of the range."""

@@ -14,10 +14,10 @@ from roadscan.assets.kernels.corridors import mark_corridor
 from roadscan.assets.quantiles import quantiles
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
+from roadscan.compute.array_types import Int32
 from roadscan.core.extras import cv2
 
 Bools = npt.NDArray[np.bool_]
-Int32 = npt.NDArray[np.int32]
 
 REACH_M: Final = 8.0
 """A vehicle of 7 m with the ground around it, by which it is told from other things, lies within this (m)."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 
 def quantiles(values: npt.NDArray[np.number[Any]], shares: Sequence[float]) -> list[float]:

@@ -8,8 +8,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-Float64 = npt.NDArray[np.float64]
-Float32 = npt.NDArray[np.float32]
+from roadscan.compute.array_types import Float32, Float64
 
 
 @dataclass(frozen=True, eq=False)

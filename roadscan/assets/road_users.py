@@ -25,11 +25,10 @@ from roadscan.assets.moving import (
 from roadscan.assets.quantiles import quantiles
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
+from roadscan.compute.array_types import Float64, Int32
 from roadscan.core.extras import cv2
 
 Bools = npt.NDArray[np.bool_]
-Int32 = npt.NDArray[np.int32]
-Float64 = npt.NDArray[np.float64]
 
 VEHICLE: Final = Judge("vehicle", "9028bd8bc57751fb")
 """Is a group of cells a vehicle, a part of one, or a row of them?"""

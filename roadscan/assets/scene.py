@@ -13,10 +13,8 @@ import numpy.typing as npt
 from roadscan.assets.kernels.beams import ground_heights
 from roadscan.assets.returns import Returns
 from roadscan.assets.statistics import Statistics
+from roadscan.compute.array_types import Float32, Float64
 from roadscan.compute.kernel_options import read_only
-
-Float64 = npt.NDArray[np.float64]
-Float32 = npt.NDArray[np.float32]
 
 _AROUND_M, _STEP_M = 2.0, 3.0  # Margin around the returns, and step of the extent (m).
 

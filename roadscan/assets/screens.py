@@ -11,8 +11,6 @@ import pyarrow as pa
 from roadscan.assets import classes
 from roadscan.assets.scene import Scene
 
-Int64 = npt.NDArray[np.int64]
-
 EDGE_M: Final = 0.5
 """Edge of a voxel (m); voxels are anchored at the map's origin and at height 0."""
 SCREENS: Final = pa.schema(

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.assets.kernels.smoothing import convolve
+from roadscan.compute.array_types import Float64
 from roadscan.compute.kernel_options import read_only
-
-Float64 = npt.NDArray[np.float64]
 
 
 def gaussian(values: Float64, sigma_cells: float, truncate: float) -> Float64:

@@ -15,11 +15,11 @@ from roadscan.assets.kernels.standing_classes import ALONE, LEAFY, WALL, WIRE, s
 from roadscan.assets.overheads import overhead_classes
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
+from roadscan.compute.array_types import Float32
 from roadscan.compute.kernel_options import read_only
 from roadscan.core.extras import cv2
 
 Bools = npt.NDArray[np.bool_]
-Float32 = npt.NDArray[np.float32]
 
 REACH_M: Final = 8.0
 """A roof of 6 m, with the cubes around that tell its scatter, lies within this (m)."""

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 import numpy.typing as npt
 
-Int64 = npt.NDArray[np.int64]
+from roadscan.compute.array_types import Int64
 
 
 def touching(flat: Int64, steps: Iterable[int]) -> npt.NDArray[np.int32]:

@@ -17,12 +17,12 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.camera import Interior
 from roadscan.core.errors import ConfigError
 from roadscan.core.extras import cv2
 from roadscan.core.strict import Strict
 
-Float64 = npt.NDArray[np.float64]
 Grey = npt.NDArray[np.uint8]
 
 _PARAMETERS: Final = 9

@@ -22,15 +22,12 @@ import numpy.typing as npt
 from roadscan.calibrate.estimator import Calibrated, Calibration, Estimate, Prior, calibrate
 from roadscan.calibrate.evidence import Known, Seen, Ties, Traverse
 from roadscan.calibrate.rotations import exponential, logarithm
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.camera import Interior
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.extras import cv2
 from roadscan.core.rig import Mounting
 from roadscan.core.settings.calibration import CalibrationSettings
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 KIND: Final = "resection"
 SENSOR_FROM_OPENCV: Final[Float64] = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.colours.kernels.looks import Camera
+from roadscan.compute.array_types import Float64
 from roadscan.pictures.placed import Pictures
-
-Float64 = npt.NDArray[np.float64]
 
 _STEP_M: Final = 20.0
 """Distance (m) over which the turn from the map to the world is taken. The map is straight to 1 mm within 50 m: 0.02

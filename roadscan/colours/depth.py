@@ -10,13 +10,9 @@ import numpy.typing as npt
 
 from roadscan.colours.kernels.depths import grow, nearest_in_pixels, slopes
 from roadscan.colours.kernels.looks import LEAST_M, MOVED, MOVED_M, STEPS, UNKNOWN, VOTED, VOTED_M, Camera, project
+from roadscan.compute.array_types import Float32, Int64, UInt8, UInt16
 from roadscan.core.extras import cv2
 from roadscan.pictures.kernels.lens import FOCAL_X, FOCAL_Y, HEIGHT, WIDTH
-
-Float32 = npt.NDArray[np.float32]
-Int64 = npt.NDArray[np.int64]
-UInt8 = npt.NDArray[np.uint8]
-UInt16 = npt.NDArray[np.uint16]
 
 _MOST_PIXELS: Final = 500_000
 """Most pixels of a depth image: its pixels stand for so many of the picture's that it has no more."""

@@ -8,9 +8,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-Float64 = npt.NDArray[np.float64]
-Float32 = npt.NDArray[np.float32]
-Int64 = npt.NDArray[np.int64]
+from roadscan.compute.array_types import Float32, Float64, Int64
 
 CELL_M: Final = 0.5
 """Edge of the cubes (m) in which pictures are compared; they are anchored at the map's origin and at height 0."""

@@ -9,10 +9,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.grid import Bounds
 from roadscan.tiles.cells import TileCells
-
-Float64 = npt.NDArray[np.float64]
 
 HALO_M: Final = 8.0
 """How far beyond a tile its cells tell of the road in it (m)."""

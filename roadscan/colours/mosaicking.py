@@ -7,8 +7,7 @@ import numpy.typing as npt
 
 from roadscan.colours.kernels.blending import blend
 from roadscan.colours.painting import Looks
-
-UInt8 = npt.NDArray[np.uint8]
+from roadscan.compute.array_types import UInt8
 
 
 def blended(looks: Looks) -> tuple[UInt8, npt.NDArray[np.int32]]:

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-Float32 = npt.NDArray[np.float32]
+from roadscan.compute.array_types import Float32
 
 _CUBE_M: Final = 0.5
 """Edge of the cubes (m); they are anchored at the origin of the points."""

@@ -20,13 +20,9 @@ from roadscan.colours.kernels.looks import (
     look,
     weighted_medians,
 )
+from roadscan.compute.array_types import Float32, Float64, Int64, UInt8
 from roadscan.pictures.colours import ColourSource
 from roadscan.pictures.placed import Pictures
-
-Float32 = npt.NDArray[np.float32]
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-UInt8 = npt.NDArray[np.uint8]
 
 _RAMP: Final = 0.05
 """Share of a picture's shorter edge in which weights rise from the border."""

@@ -13,12 +13,10 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.errors import ConfigError, TimeSystemError
 from roadscan.core.gpstime import EARLIEST_GPS_NS, LATEST_GPS_NS, UNIT_NS, Clock, TimeSystem, unroll_week
 from roadscan.core.survey import ClockConfig
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 ClockLike = Clock | Mapping[str, Any] | None
 """A clock, its keys as in the survey file, or None: the stamps are GPS nanoseconds, or calendar times with a zone."""

@@ -10,19 +10,16 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from roadscan.compute.array_types import Bool, Int64
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.core.witness import Finding, Witness
 from roadscan.ingest.log_check import LogCheck, epochs_in
 from roadscan.ingest.reading.format import LogHeader, Rows
 from roadscan.ingest.reading.records import LEAP_NS
 from roadscan.store.writer import LogWriter
-
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 TIME_GOES_BACK: Final = Witness(
     "time_goes_back",

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float64
 from roadscan.compute.robust import scatter_about
 from roadscan.core.witness import Finding, Witness
 from roadscan.ingest.kernels.laser_ranges import by_firing, residuals
@@ -18,9 +19,6 @@ from roadscan.ingest.log_check import LogCheck
 from roadscan.ingest.reading.format import LogHeader, Rows
 from roadscan.store.readings.returns import sensor_xyz_m
 from roadscan.store.writer import LogWriter
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 LASER_RANGE: Final = Witness(
     "laser_range",

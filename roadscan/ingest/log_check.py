@@ -6,14 +6,12 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
-import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Int64
 from roadscan.ingest.reading.format import LogHeader, Rows
 from roadscan.store.writer import LogWriter
 
-Int64 = npt.NDArray[np.int64]
 Refused: TypeAlias = tuple[Int64, str]
 """Rows of a chunk (by index) that are left out, with the reason."""
 

@@ -19,8 +19,6 @@ from roadscan.ingest.reading.format import LogHeader
 from roadscan.poses.motion import PoseMotion, Same
 from roadscan.store.writer import LogWriter
 
-Int64 = npt.NDArray[np.int64]
-
 POSE_COURSE: Final = Witness(
     "pose_course",
     input="trajectory",

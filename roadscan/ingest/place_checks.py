@@ -13,14 +13,12 @@ import pyarrow as pa
 import pyproj
 from pyproj.exceptions import ProjError
 
+from roadscan.compute.array_types import Bool, Float64
 from roadscan.core.crs import LOCAL_WORLD, crs_from_text
 from roadscan.core.errors import RoadscanError
 from roadscan.core.witness import Witness
 from roadscan.ingest.reading.format import LogHeader
 from roadscan.ingest.reading.poses import GRID_MAX_M
-
-Float64 = npt.NDArray[np.float64]
-Bool = npt.NDArray[np.bool_]
 
 VERSION: Final = 2
 """Raised when other records are left out, so that logs of clouds and GNSS are read again."""

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.counted import counted
 from roadscan.core.crs import LOCAL_WORLD
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
@@ -27,10 +28,6 @@ from roadscan.ingest.reading.gnss import ned_from_ecef
 from roadscan.poses.leaps import Leaps, PoseTrack, Stall, Step, find_leaps
 from roadscan.poses.motion import frozen
 from roadscan.store.writer import LogWriter
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 VERSION: Final = 3
 """Raised when other poses are left out, so that logs of trajectories and of GNSS are read again."""

@@ -10,19 +10,16 @@ from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import pyproj
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.crs import LOCAL_WORLD, crs_from_text, geodetic_from_world, geographic_of
 from roadscan.core.frames import ENU_FROM_NED, ecef_from_ned, rotation_from_quaternion, rph_from_rotation
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.witness import Finding, Witness
 from roadscan.ingest.reading.format import LogHeader, LogSource
 from roadscan.store.writer import LogWriter
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 COARSE_VALUES: Final = Witness(
     "coarse_values",

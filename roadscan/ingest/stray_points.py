@@ -11,13 +11,11 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from roadscan.compute.array_types import Bool, Int64
 from roadscan.core.witness import Witness
 from roadscan.ingest.log_check import LogCheck
 from roadscan.ingest.reading.format import LogHeader, Rows
 from roadscan.store.writer import LogWriter
-
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 STRAY_POINT: Final = Witness(
     "stray_point",

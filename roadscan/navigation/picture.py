@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.canvas import empty_figure, save_whole
 from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
 from roadscan.core.frames import ENU_FROM_NED, ecef_from_ned, rotation_from_quaternion
@@ -20,8 +21,6 @@ from roadscan.navigation.inertial.readings import GnssSolutions, Innovations, So
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 OUTAGE_S: Final = 2.0

@@ -7,16 +7,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.camera import Interior
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.pictures.lens import PARAMETERS
 from roadscan.store.small_tables import read_small
 from roadscan.store.store import Store
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 TABLE: Final = "camera_corrections"
 COLUMNS: Final = (*PARAMETERS, "clock_s", "line_time_s")

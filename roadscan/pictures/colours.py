@@ -10,13 +10,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, UInt8
 from roadscan.pictures.files import read_picture
 from roadscan.pictures.placed import Pictures
 from roadscan.pictures.views import NO_VIEW, Shown, best_views, sampled
 from roadscan.store.codecs.image_files import ImageError
-
-UInt8 = npt.NDArray[np.uint8]
-Float64 = npt.NDArray[np.float64]
 
 _KEPT_BYTES: Final = 160 << 20
 """Decoded pictures cached for the following tiles (bytes); one is cached whatever its size."""

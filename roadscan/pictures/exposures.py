@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.calibrate.resection import SENSOR_FROM_OPENCV
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.camera import Interior
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.rig import Sensor
@@ -22,10 +23,6 @@ from roadscan.navigation.tasks.trajectories import TrajectorySource, load_record
 from roadscan.pictures.frames.chosen import camera_pictures, folder_of
 from roadscan.pictures.views import Lens
 from roadscan.poses.trajectory import world_from_ned
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 _PIECE_NS: Final = 600 * NS_PER_S
 """Poses of this long (ns) are loaded at once."""

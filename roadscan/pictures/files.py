@@ -5,12 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import UInt8
 from roadscan.core.extras import cv2
 from roadscan.store.codecs.image_files import ImageError, image_size
-
-UInt8 = npt.NDArray[np.uint8]
 
 
 def read_picture(path: Path, size_px: tuple[int, int], *, grey: bool = False) -> UInt8:

@@ -12,11 +12,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.extras import cv2
 from roadscan.pictures.kernels.lens import ROW_ROUNDS, ROW_SETTLED_PX
 from roadscan.pictures.views import Lens
-
-Float64 = npt.NDArray[np.float64]
 
 PARAMETERS: Final = ("focal_x_px", "focal_y_px", "centre_x_px", "centre_y_px", "k1", "k2", "p1", "p2", "k3")
 """The parameters of a lens in the order of its derivatives."""

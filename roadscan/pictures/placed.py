@@ -14,6 +14,7 @@ import numpy.typing as npt
 import shapely
 
 from roadscan.calibrate.resection import SENSOR_FROM_OPENCV
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.crs import MapFrame
 from roadscan.core.errors import ConfigError, RunError, nearest
 from roadscan.core.gpstime import NS_PER_S
@@ -27,9 +28,6 @@ from roadscan.pictures.camera_changes import changed, clock_ns, load_camera_chan
 from roadscan.pictures.frames.chosen import camera_pictures, folder_of
 from roadscan.pictures.views import Lens, PictureRule, Views
 from roadscan.poses.trajectory import Poses, world_from_ned
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _PIECE_NS: Final = 600 * NS_PER_S
 """Poses of this long (ns) are loaded at once."""

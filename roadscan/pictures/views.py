@@ -10,15 +10,11 @@ from typing import Final, Self
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64, Int64, UInt8
 from roadscan.core.camera import Interior
 from roadscan.core.extras import cv2
 from roadscan.pictures.kernels.lens import AROUND, FOLD, HEIGHT, PARAMETERS, ROW_SHIFT, ROW_TURN, WIDTH
 from roadscan.pictures.kernels.picture_colours import sample, take_better
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
-UInt8 = npt.NDArray[np.uint8]
 
 __all__ = ["AROUND", "HEIGHT", "NO_VIEW", "WIDTH", "Lens", "PictureRule", "Shown", "Sights", "Views",
            "best_views", "sampled", "sights"]  # fmt: skip

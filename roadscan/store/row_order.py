@@ -9,12 +9,12 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Int64
 from roadscan.store.schema import TableSchema
 
 _WORD_BITS: Final = 64  # bits of the number that rows are sorted by: key and row number
 
 Array = npt.NDArray[Any]
-Int64 = npt.NDArray[np.int64]
 
 
 def sorted_rows(schema: TableSchema, rows: pa.Table) -> pa.Table:

@@ -18,13 +18,9 @@ import numpy.typing as npt
 
 from roadscan.adjust.bundle.measurements import FREE_M, Measurements, Numbers, Seen, State, seen
 from roadscan.adjust.observations import COMPONENTS, FIXED, KINDS, MOUNTED, Observations
+from roadscan.compute.array_types import Bool, Float32, Float64, Int64
 from roadscan.pictures.lens import pixels_of
 from roadscan.poses.trajectory import world_from_ned
-
-Float32 = npt.NDArray[np.float32]
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 KIND: Final = "picture_depth"
 _NEAREST: Final = 12  # Returns that a plane is laid through.

@@ -16,9 +16,8 @@ import numpy.typing as npt
 
 from roadscan.adjust.bundle.range_edges import OTHERS, TURNS_DEG, EdgeScores
 from roadscan.adjust.observations import CAMERA, COMPONENTS, FIXED, KINDS, MOUNTED, Observations
+from roadscan.compute.array_types import Float64
 from roadscan.pictures.lens import PARAMETERS
-
-Float64 = npt.NDArray[np.float64]
 
 KIND: Final = "picture_edge"
 _LEAST_PICTURES: Final = 4

@@ -16,9 +16,9 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.observations import CAMERA, COMPONENTS, FIXED, KINDS, MOUNTED, Observations
+from roadscan.compute.array_types import Bool, Float64, Int32, Int64
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.pictures.camera_changes import changed
 from roadscan.pictures.exposures import Exposures
@@ -26,11 +26,6 @@ from roadscan.pictures.lens import PARAMETERS, derivatives, pixels_of, rays_of
 from roadscan.pictures.ties.tracks import places_of
 from roadscan.pictures.views import Lens
 from roadscan.poses.trajectory import Corrections, world_from_ned
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Int32 = npt.NDArray[np.int32]
-Bool = npt.NDArray[np.bool_]
 
 FREE_M: Final = 10.0
 """1 σ of a tie point about where its rays meet (m): far more than what they leave open."""

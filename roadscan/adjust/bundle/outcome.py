@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.adjustment import Adjustment
 from roadscan.adjust.bundle.depths import Surfaces, depth_rows
@@ -16,11 +15,9 @@ from roadscan.adjust.bundle.measurements import Measurements, State, met_at, res
 from roadscan.adjust.bundle.solve import Approached, PictureEvidence, state_of
 from roadscan.adjust.control.control import ControlPoint
 from roadscan.adjust.observations import KINDS
+from roadscan.compute.array_types import Float64
 from roadscan.pictures.ties.tracks import places_of
 from roadscan.poses.trajectory import world_from_ned
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _BOUNDS: Final = (0.025, 0.975)
 """Chances below and above which χ² is out of its bounds: 95 % of right solutions lie between."""

@@ -8,12 +8,10 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.bundle.outcome import PictureOutcome
+from roadscan.compute.array_types import Float64
 from roadscan.core.canvas import empty_figure
-
-Float64 = npt.NDArray[np.float64]
 
 _CELLS: Final = (16, 10)  # Columns and rows of the map.
 _LEAST: Final = 4  # Measurements of a cell whose mean is shown.

@@ -14,17 +14,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.kernels.range_edges import continued, scores_of_turns
+from roadscan.compute.array_types import Float32, Float64, UInt8
 from roadscan.core.extras import cv2
 from roadscan.pictures.lens import PARAMETERS, derivatives
 from roadscan.pictures.views import Lens
-
-Float32 = npt.NDArray[np.float32]
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-UInt8 = npt.NDArray[np.uint8]
 
 TURNS_DEG: Final = (np.linspace(-1.8, 1.8, 31), np.linspace(-1.8, 1.8, 31), np.linspace(-2.4, 2.4, 17))
 """Turns that are tried about the camera's axes right, down and ahead (degrees): ± 1.5° and some more, so that the best

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.adjustment import Adjustment, CameraErrors, adjust
 from roadscan.adjust.bundle.measurements import Measurements, State, met_at, seen
@@ -21,10 +20,9 @@ from roadscan.adjust.bundle.solve import Approached, PictureEvidence, entering, 
 from roadscan.adjust.observations import CAMERA, COMPONENTS, KINDS, Observations
 from roadscan.adjust.process import CameraPrior, MountingPrior
 from roadscan.adjust.solver_settings import AdjustmentSettings
+from roadscan.compute.array_types import Float64
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.poses.trajectory import world_from_ned
-
-Float64 = npt.NDArray[np.float64]
 
 _FREE_FOCAL: Final = 0.2
 """1 σ of a focal length, as a share of it, of which nothing is known: a lens of another zoom or another camera."""

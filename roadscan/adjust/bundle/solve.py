@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.adjustment import Adjustment, adjust
 from roadscan.adjust.bundle.depths import DepthRows, NearReturns, Surfaces, depth_rows, surfaces_of
@@ -28,10 +27,7 @@ from roadscan.adjust.process import CameraPrior, MountingPrior, RunPrior
 from roadscan.adjust.solver_settings import AdjustmentSettings
 from roadscan.adjust.weights import igg_iii
 from roadscan.calibrate.robust import length_limit
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
+from roadscan.compute.array_types import Bool, Float64, Int64
 
 _MOST: Final = 14  # Solutions on the way, at most; eight are usual.
 _ROUNDS: Final = 2

@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.bundle.picture import residuals_of
 from roadscan.adjust.control.control import ControlPoint, Sighting
@@ -72,6 +71,7 @@ from roadscan.adjust.tasks.ties_again import Again, first_ties, settled
 from roadscan.adjust.tasks.tracks import adjusted_sources, runs_of, tracks_of
 from roadscan.adjust.tasks.walls import lean_findings, leans
 from roadscan.adjust.tie_settings import PlaceSettings
+from roadscan.compute.array_types import Float64
 from roadscan.core.counted import counted as count_of
 from roadscan.core.counted import listed
 from roadscan.core.extras import can_draw
@@ -86,8 +86,6 @@ from roadscan.run.engine.fingerprint import key_of
 from roadscan.run.session import Session
 from roadscan.store.digest import file_digest
 from roadscan.store.manifest import CHANGED, DAMAGED, MISSING, Manifest, OutputRecord
-
-Float64 = npt.NDArray[np.float64]
 
 _BUNDLE_BYTES: Final = 20_000_000.0
 """Approximate compressed bytes that a task reads."""

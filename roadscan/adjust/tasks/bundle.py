@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.bundle.measurements import Measurements, Numbers
 from roadscan.adjust.bundle.settings import CameraPriors
@@ -18,6 +17,7 @@ from roadscan.adjust.tasks.camera_priors import adjusted_cameras, asks_pictures,
 from roadscan.adjust.tasks.edge_scores import SCORES, EdgeTask, edge_tasks, load_boresights, write_scores
 from roadscan.adjust.tasks.mountings import Mounted
 from roadscan.adjust.tasks.tie_depths import RETURNS, DepthTask, depth_tasks, load_returns, write_returns
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.counted import listed
 from roadscan.core.ids import of_run
 from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory_source
@@ -31,9 +31,6 @@ from roadscan.pictures.ties.chains import TRACKS
 from roadscan.pictures.ties.work import ALL
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.store import Store
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 AskedOfPictures = DepthTask | EdgeTask
 Collect = Callable[[str, Callable[[Any], OutputRecord], Sequence[AskedOfPictures]], None]

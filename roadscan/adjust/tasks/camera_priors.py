@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.bundle.settings import CameraPriors
 from roadscan.adjust.observations import CAMERA
+from roadscan.compute.array_types import Float64
 from roadscan.core.rig import Sensor
 from roadscan.core.survey import Survey
 from roadscan.pictures.settings import PictureTiesConfig
-
-Float64 = npt.NDArray[np.float64]
 
 
 def asks_pictures(survey: Survey) -> bool:

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.adjustment import CameraErrors
 from roadscan.adjust.bundle.outcome import ControlOfPictures, PictureOutcome
@@ -18,8 +17,6 @@ from roadscan.core.witness import Finding, Witness
 from roadscan.pictures.camera_changes import COLUMNS, JOINT, JOINT_TABLE, TABLE
 from roadscan.store.small_tables import read_small, small_path, write_small
 from roadscan.store.store import Store
-
-Float64 = npt.NDArray[np.float64]
 
 _UPPER: Final = np.triu_indices(JOINT)
 """Entries of a joint covariance that the table holds."""

@@ -6,17 +6,14 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.control.control import Sighting
 from roadscan.adjust.control.control_faults import NAMED, WrongPoint, swapped
 from roadscan.adjust.control.control_test import COMPONENTS, HEIGHT, PLACE, AppliedOffset, ControlVerdict, PlaneShift
 from roadscan.adjust.process import RunPrior
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.counted import listed
 from roadscan.core.witness import Finding, Witness
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 CONTROL: Final = "control"
 """Subject of what concerns many points."""

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.adjust.bundle.edge_boresight import EdgeBoresight, Sighted, boresight_of
@@ -33,8 +32,6 @@ from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.store.writer import parquet_bytes
-
-Float64 = npt.NDArray[np.float64]
 
 SCORES: Final = "edge_scores"
 """Table, and product of its files in the manifest."""

@@ -10,9 +10,8 @@ import numpy.typing as npt
 
 from roadscan.adjust.tasks.tie_work import KnownTies
 from roadscan.adjust.ties.tie import FEW_CELLS, HEIGHT, PLANE, SAME_PASS, SCATTERED, SHIFT, STEEP, TOO_FAR, TWO_SURFACES
+from roadscan.compute.array_types import Float64
 from roadscan.core.witness import Finding, Witness
-
-Float64 = npt.NDArray[np.float64]
 
 TIES_FAIL: Final = Witness(
     "ties_fail",

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.control.control import Sighting, moved_m
 from roadscan.adjust.control.control_test import HEIGHT
@@ -24,12 +23,11 @@ from roadscan.adjust.quality import (
     vertical_accuracy,
 )
 from roadscan.adjust.tasks.solution import Evidence, Solution
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.ways import way_along
 from roadscan.poses.mounting_change import MountingChange
 from roadscan.poses.trajectory import Corrections
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 Rows = list[dict[str, Any]]
 Held = Mapping[str, Corrections]
 _AT_THEIR_PLACE: Final = ("found", "picked")

@@ -30,14 +30,12 @@ from roadscan.adjust.tasks.mountings import Mounted
 from roadscan.adjust.tasks.near import Sources
 from roadscan.adjust.tasks.tie_work import KnownTies
 from roadscan.adjust.tasks.tracks import runs_of
+from roadscan.compute.array_types import Bool, Float64
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.gpstime import NS_PER_S, gps_ns_from_utc
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
-
-Float64 = npt.NDArray[np.float64]
-Bool = npt.NDArray[np.bool_]
 
 HAND_TIE: Final = Witness(
     "hand_tie",

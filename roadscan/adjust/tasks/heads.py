@@ -12,7 +12,6 @@ from itertools import groupby
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.observations import KINDS
 from roadscan.adjust.places import Place, Track, places_of_overlap
@@ -24,13 +23,12 @@ from roadscan.adjust.tasks.tracks import runs_of, tracks_of
 from roadscan.adjust.tie_settings import PlaceSettings
 from roadscan.adjust.ties.at_place import Ties
 from roadscan.adjust.ties.tie import HEIGHT
+from roadscan.compute.array_types import Float64
 from roadscan.compute.robust import scatter_about
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.run.engine.fingerprint import key_of
-
-Float64 = npt.NDArray[np.float64]
 
 _NARROW_M: Final = 0.03
 """Least overlap of the strips of two compared heads (m): a cell of 0.025 m, and some of the next."""

@@ -18,6 +18,7 @@ from roadscan.adjust.settings import AdjustConfig
 from roadscan.adjust.tasks.camera_priors import adjusted_cameras, camera_sigma
 from roadscan.adjust.tasks.near import Sources
 from roadscan.adjust.unknowns import sharing
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.rig import Mountings
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
@@ -31,9 +32,6 @@ from roadscan.georeference.sources import (
 from roadscan.poses.mounting_change import MountingChange, Seat
 from roadscan.store.small_tables import read_small, small_path, write_small
 from roadscan.store.store import Store
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 TABLE: Final = "mounting_corrections"
 _NAMES: Final = (

@@ -13,6 +13,7 @@ import pyarrow as pa
 
 from roadscan.adjust.patches import PassReadings
 from roadscan.adjust.places import Traverse
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.grid import QUANTA_PER_M
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.georeference.place import EIGHT_TO_SIXTEEN_BITS, EVERYWHERE, Placement
@@ -28,10 +29,6 @@ from roadscan.georeference.sources import (
 from roadscan.poses.level import LevelPoses, level_poses
 from roadscan.store.logs import DataFile
 from roadscan.store.store import Store
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 _POSE_STEP_NS: Final = 2_000_000
 """Readings this close in time (ns) share a pose: at 30 m/s that shifts arms by 60 mm."""

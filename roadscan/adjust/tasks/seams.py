@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.observations import KINDS
 from roadscan.adjust.places import Place, Traverse
@@ -22,8 +21,6 @@ from roadscan.georeference.sources import MountingChanges, change_of
 from roadscan.poses.mounting_change import MountingChange, Seat
 from roadscan.poses.trajectory import Corrections
 from roadscan.run.engine.compute import Compute, reason_of
-
-Float64 = npt.NDArray[np.float64]
 
 _CHOSEN: Final = ("the worst seam before", "a typical seam")
 

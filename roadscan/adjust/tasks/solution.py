@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.adjustment import Adjustment, CameraErrors, CommonErrors, ControlErrors, MountingErrors, adjust
 from roadscan.adjust.bundle.edge_boresight import edge_observations
@@ -52,6 +51,7 @@ from roadscan.adjust.tasks.mountings import Cause, Mounted, cause_line, causes, 
 from roadscan.adjust.tasks.near import Sources
 from roadscan.adjust.tasks.tie_work import KnownTies
 from roadscan.adjust.tasks.tracks import span_of
+from roadscan.compute.array_types import Bool, Float64, Int32, Int64
 from roadscan.core.witness import Finding
 from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
 from roadscan.navigation.tasks.pose_sigma import stated_pose_sigma
@@ -59,11 +59,6 @@ from roadscan.navigation.tasks.trajectories import TrajectorySource, load_record
 from roadscan.poses.level import level_poses
 from roadscan.poses.mounting_change import NO_SEAT
 from roadscan.poses.trajectory import Corrections
-
-Float64 = npt.NDArray[np.float64]
-Int32 = npt.NDArray[np.int32]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 _WIDENED: Final = 3
 """Adjustments, at most, until no mounting is off by more than its σ allows."""

@@ -14,6 +14,7 @@ from roadscan.adjust.bundle.depths import NearReturns
 from roadscan.adjust.bundle.settings import CameraPriors
 from roadscan.adjust.tasks.mountings import Mounted
 from roadscan.adjust.tasks.near import NearFile, placed_readings
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.plan.road import road_key
@@ -28,10 +29,6 @@ from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.store.writer import parquet_bytes
-
-Float32 = npt.NDArray[np.float32]
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 RETURNS: Final = "tie_returns"
 """Table, and product of its files in the manifest."""

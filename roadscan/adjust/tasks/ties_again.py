@@ -24,14 +24,12 @@ from roadscan.adjust.tasks.tie_work import KnownTies, TieTask, tie_tasks
 from roadscan.adjust.tasks.tracks import runs_of
 from roadscan.adjust.tie_settings import TieSettings
 from roadscan.adjust.ties.far_apart import agreeing, is_matched, misplaced, places_of_pairs
+from roadscan.compute.array_types import Bool, Float64
 from roadscan.core.counted import counted
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.poses.trajectory import Corrections
-
-Bool = npt.NDArray[np.bool_]
-Float64 = npt.NDArray[np.float64]
 
 _STILL: Final[Shift] = (0.0, 0.0, 0.0)  # No shift (m).
 _STEP_M: Final = 0.001

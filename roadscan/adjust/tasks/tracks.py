@@ -6,19 +6,16 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.adjust.places import Track
 from roadscan.adjust.swath import Swath, swath_of
 from roadscan.adjust.tasks.near import PlacedReadings, Sources, placed_readings
+from roadscan.compute.array_types import Int64
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.sources import Georeferencer, RawSlice, ReadingSource, geometry_of, read_rows
 from roadscan.navigation.tasks.trajectories import load_recorded
 from roadscan.poses.level import LevelPoses, level_poses
 from roadscan.store.logs import DataFile
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _STEP_NS: Final = 50_000_000  # Spacing of a track's poses (ns).
 _SAMPLES: Final = 6

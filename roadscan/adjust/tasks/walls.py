@@ -16,9 +16,8 @@ import numpy.typing as npt
 
 from roadscan.adjust.places import Track
 from roadscan.adjust.ties.tie import PLANE
+from roadscan.compute.array_types import Float64
 from roadscan.core.witness import Finding, Witness
-
-Float64 = npt.NDArray[np.float64]
 
 _STEEP_RAD: Final = np.radians(6.0)
 """A plane that leans less than this from the vertical may be a wall: more than any roll that is worth a run, and less

@@ -18,10 +18,8 @@ from roadscan.assets.paint.contrast import Contrast
 from roadscan.assets.paint.detection import paint_of
 from roadscan.assets.quantiles import median
 from roadscan.assets.scene import Scene
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.extras import cv2
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _CELL_M: Final = 0.1
 """Edge of a cell in which spots are sought (m)."""

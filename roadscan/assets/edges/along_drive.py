@@ -17,9 +17,8 @@ from roadscan.assets.edges.profiles import smooth_line
 from roadscan.assets.edges.raster import HeightRaster, raster_of
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
+from roadscan.compute.array_types import Float64
 from roadscan.compute.edges.across import edge_along
-
-Float64 = npt.NDArray[np.float64]
 
 STATION_M: Final = 0.5  # Distance of stations along the drive (m).
 NEAREST_M: Final = 0.8  # Edges are sought from this distance to the drive (m) …

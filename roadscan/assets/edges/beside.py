@@ -16,8 +16,7 @@ from roadscan.assets.kernels import transects as kernel
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 from roadscan.assets.smoothing import gaussian
-
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 FIRST_M: Final = 0.3
 """The transect begins this far (m) behind the middle of the edge's face."""

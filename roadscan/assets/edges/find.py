@@ -16,8 +16,8 @@ from roadscan.assets.edges.raster import HeightRaster, raster_of
 from roadscan.assets.edges.steps import step_places
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
+from roadscan.compute.array_types import Float64
 
-Float64 = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 

@@ -17,9 +17,8 @@ from roadscan.assets.judgement.judge import Judge
 from roadscan.assets.kernels.corridors import mark_corridor
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
+from roadscan.compute.array_types import Float64
 from roadscan.core.extras import cv2
-
-Float64 = npt.NDArray[np.float64]
 
 KERB: Final = Judge("kerb", "cdef227f1ee2f1fc")
 """Whether a node of an edge lies at a kerb."""

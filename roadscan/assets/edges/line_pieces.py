@@ -15,10 +15,8 @@ from roadscan.assets.edges.find import Edge
 from roadscan.assets.edges.profiles import Nodes
 from roadscan.assets.edges.raster import HeightRaster
 from roadscan.assets.scene import Box, Scene
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.ways import way_along
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 NODE_COLUMNS: Final = (
     "easting_m", "northing_m", "height_m", "step_m", "sigma_step_m", "face_m", "scatter_m", "sigma_m", "seen_low",

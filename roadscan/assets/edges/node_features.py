@@ -18,8 +18,7 @@ from roadscan.assets.edges.find import Edge
 from roadscan.assets.edges.profiles import NODE_M
 from roadscan.assets.edges.raster import HeightRaster, raster_of
 from roadscan.assets.scene import Scene
-
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 _AROUND_NODES: Final = 7
 """Features are medians over this many nodes (3 m): an edge is what it is over a length, not at a point."""

@@ -7,14 +7,11 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.assets.bins import in_bins
 from roadscan.assets.edges.steps import Places
 from roadscan.assets.kernels.edge_links import MAX_LINKS, best_ways, find_links, trace
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from roadscan.compute.array_types import Float64, Int64
 
 FREE_M: Final = 0.3
 """Distance of consecutive places (m) that is no gap."""

@@ -13,10 +13,8 @@ from roadscan.assets.bins import cells_of, in_bins
 from roadscan.assets.edges.paths import Chain
 from roadscan.assets.edges.raster import HeightRaster
 from roadscan.assets.kernels import step_profiles as kernel
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.ways import way_along
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 NODE_M: Final = 0.5
 """Distance of nodes along an edge (m)."""

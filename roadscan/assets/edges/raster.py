@@ -16,9 +16,8 @@ from roadscan.assets.kernels.low_heights import low_heights
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 from roadscan.assets.smoothing import gaussian
+from roadscan.compute.array_types import Float64
 from roadscan.core.extras import cv2
-
-Float64 = npt.NDArray[np.float64]
 
 CELL_M: Final = 0.1  # Edge of a cell (m).
 DEPTH_M: Final = 0.12

@@ -23,9 +23,8 @@ from roadscan.assets.kernels.step_filter import (
     take_excess,
     thin,
 )
+from roadscan.compute.array_types import Float64
 from roadscan.core.extras import cv2
-
-Float64 = npt.NDArray[np.float64]
 
 
 class StepSettings(NamedTuple):

@@ -13,10 +13,9 @@ import scipy.spatial
 import shapely
 
 from roadscan.assets.edges.line_pieces import Line
+from roadscan.compute.array_types import Float64
 from roadscan.compute.robust import scatter_about
 from roadscan.compute.ways import way_along
-
-Float64 = npt.NDArray[np.float64]
 
 MEDIAN_NODES: Final = 5
 """A width is the median of this many nodes, so that a pole or a tree does not end a strip."""

@@ -11,10 +11,8 @@ import numpy.typing as npt
 import shapely
 
 from roadscan.assets import classes
+from roadscan.compute.array_types import Float64, UInt8
 from roadscan.core.extras import cv2
-
-Float64 = npt.NDArray[np.float64]
-UInt8 = npt.NDArray[np.uint8]
 
 EDGE_PX: Final = 220  # Edge of a thumbnail (pixels).
 _GAP_PX: Final = 6  # Gap between thumbnails (pixels).

@@ -20,9 +20,7 @@ from roadscan.assets.scene import Scene
 from roadscan.assets.upright.brightness import brightness
 from roadscan.assets.upright.regions import regions_of
 from roadscan.assets.upright.slices import usable
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from roadscan.compute.array_types import Float64, Int64
 
 _CELL_M: Final = 0.15  # Edge of a cell, seen from above (m): things that stand farther apart are two.
 _LOWEST_M: Final = 0.08

@@ -14,8 +14,7 @@ from roadscan.assets.ground.sparse import sparse_ground
 from roadscan.assets.ground.surface import Found, Place, is_dense
 from roadscan.assets.kernels.heights import heights_above
 from roadscan.assets.scene import Box, GroundModel
-
-Float32 = npt.NDArray[np.float32]
+from roadscan.compute.array_types import Float32
 
 _NOISE_M: Final = 0.3
 """A return farther below the ground (m) is noise."""

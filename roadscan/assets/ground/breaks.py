@@ -11,9 +11,9 @@ from roadscan.assets.bins import cells_of
 from roadscan.assets.ground.grid import Grid
 from roadscan.assets.ground.kernels.breaks import drops_on_both_sides, grow
 from roadscan.assets.ground.surface import Place
+from roadscan.compute.array_types import Float32
 
 Bools = npt.NDArray[np.bool_]
-Float32 = npt.NDArray[np.float32]
 
 _LINES: Final = 8
 """Lines through a cell: every 22.5 degrees."""

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.scene import GroundModel
+from roadscan.compute.array_types import Float64
 
-Float64 = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 
 

@@ -16,9 +16,9 @@ from roadscan.assets.ground.undersides import undersides
 from roadscan.assets.kernels.ground_cells import on_ground, scatter
 from roadscan.assets.kernels.lowest import lowest_returns
 from roadscan.assets.statistics import Statistics
+from roadscan.compute.array_types import Float32
 from roadscan.core.extras import cv2
 
-Float32 = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]
 
 LOWEST_CELL_M: Final = 0.5  # Edge of a cell of the lowest returns (m).

@@ -6,9 +6,9 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.kernels.filling import begin, halved, relax
+from roadscan.compute.array_types import Float32
 from roadscan.core.extras import cv2
 
-Float32 = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]
 
 

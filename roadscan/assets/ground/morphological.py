@@ -15,8 +15,8 @@ import numpy.typing as npt
 from roadscan.assets.ground.filling import filled
 from roadscan.assets.ground.settings import GroundSettings
 from roadscan.assets.kernels.ground_cells import least_over_disk
+from roadscan.compute.array_types import Float32
 
-Float32 = npt.NDArray[np.float32]
 Bools = npt.NDArray[np.bool_]
 
 _GROWTH: Final = 1.15

@@ -13,8 +13,7 @@ from roadscan.assets.ground.surface import Found, Place
 from roadscan.assets.kernels.ground_cells import cell_heights
 from roadscan.assets.scene import GroundModel
 from roadscan.assets.statistics import Statistics
-
-Float32 = npt.NDArray[np.float32]
+from roadscan.compute.array_types import Float32
 
 _TIMES, _LEAST_M = 2.5, 0.01
 """Returns of a cell count within this many standard deviations of their mean, and at least within this distance (m).

@@ -6,7 +6,6 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.assets.ground.breaks import with_crests
 from roadscan.assets.ground.filling import filled
@@ -18,8 +17,6 @@ from roadscan.assets.kernels.heights import heights_above
 from roadscan.assets.kernels.lowest import lowest_returns
 from roadscan.assets.scene import Box
 from roadscan.core.extras import cv2
-
-Float32 = npt.NDArray[np.float32]
 
 CELL_M: Final = 1.0  # Edge of a cell (m).
 _PIT_M: Final = 8.0

@@ -14,10 +14,8 @@ from roadscan.assets.kernels.lowest import counts
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
 from roadscan.assets.statistics import Statistics
+from roadscan.compute.array_types import Float32
 from roadscan.core.extras import cv2
-
-Float32 = npt.NDArray[np.float32]
-Float64 = npt.NDArray[np.float64]
 
 DENSE_PER_M2: Final = 4
 """Median number of returns of the non-empty square metres from which the data are those of a scanner on the road:

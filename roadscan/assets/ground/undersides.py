@@ -10,10 +10,10 @@ import numpy.typing as npt
 from roadscan.assets.bins import cells_of
 from roadscan.assets.ground.grid import Grid
 from roadscan.assets.returns import Returns
+from roadscan.compute.array_types import Float32
 from roadscan.core.extras import cv2
 
 Bools = npt.NDArray[np.bool_]
-Float32 = npt.NDArray[np.float32]
 
 _NEAR_LOWEST_M: Final = 0.15
 """Returns up to this above the lowest one of a cell (m) lie on the same surface."""

@@ -22,9 +22,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.judgement.kernels.boosted_trees import tree_sums
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import RoadscanError
-
-Float64 = npt.NDArray[np.float64]
 
 FOLDER: Final = Path(__file__).parent / "models"
 _MOST_ODDS: Final = 9.2

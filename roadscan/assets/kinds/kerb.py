@@ -21,12 +21,11 @@ from roadscan.assets.edges.line_pieces import LINE_PIECES, Line, columns_of, cut
 from roadscan.assets.edges.raster import HeightRaster, raster_of
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
 from roadscan.assets.scene import Scene
+from roadscan.compute.array_types import Float64
 from roadscan.compute.robust import scatter_about
 from roadscan.compute.ways import way_along
 from roadscan.core.extras import cv2
 from roadscan.core.strict import Strict
-
-Float64 = npt.NDArray[np.float64]
 
 SLOPED_FACE_M = 0.12
 """A kerb with a wider face (m) is sloped."""

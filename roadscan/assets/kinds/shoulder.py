@@ -18,9 +18,8 @@ from roadscan.assets.edges.line_pieces import dense
 from roadscan.assets.edges.strips import ribbon
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, KindOptions
 from roadscan.assets.scene import Scene
+from roadscan.compute.array_types import Float64
 from roadscan.compute.ways import way_along
-
-Float64 = npt.NDArray[np.float64]
 
 STATION_M = 1.0  # Distance of stations along an edge (m).
 GAP_NODES = 6

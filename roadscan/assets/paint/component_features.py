@@ -18,8 +18,7 @@ from roadscan.assets.paint.components import Component
 from roadscan.assets.paint.contrast import CELL_M, Contrast
 from roadscan.assets.paint.crosswalks import Bar
 from roadscan.assets.scene import Scene
-
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 PIECE_M: Final = 7.0
 """Shape and flatness of longer components (m) are those of their pieces: a line bends with its road."""

@@ -12,9 +12,7 @@ import numpy.typing as npt
 from roadscan.assets.bins import in_bins
 from roadscan.assets.kernels.paint_levels import distinct_in_groups
 from roadscan.assets.paint.contrast import CELL_M, Contrast
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from roadscan.compute.array_types import Float64, Int64
 
 SEED_CONTRAST: Final = 0.30  # Paint may start at cells of this contrast (share of the surface's brightness) …
 SEED_SIGMAS: Final = 3.5

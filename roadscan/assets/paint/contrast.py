@@ -6,18 +6,14 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.assets.bins import cells_of, in_bins
 from roadscan.assets.classes import PERSON, VEHICLE
 from roadscan.assets.kernels.paint_levels import contrasts, paint_levels, paint_sums, scan_lines, seen_on_ground
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box, Scene
+from roadscan.compute.array_types import Float32, Float64, Int64
 from roadscan.compute.kernel_options import read_only
-
-Float64 = npt.NDArray[np.float64]
-Float32 = npt.NDArray[np.float32]
-Int64 = npt.NDArray[np.int64]
 
 CELL_M: Final = 0.05
 """Edge of a cell of paint (m); cells lie on a grid of the map."""

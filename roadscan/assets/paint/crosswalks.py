@@ -10,8 +10,7 @@ import numpy.typing as npt
 
 from roadscan.assets.paint.contrast import CELL_M
 from roadscan.assets.paint.stripes import Stripe
-
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 _WIDTH_M: Final = (0.25, 1.0)  # Width of a bar (m).
 _LENGTH_M: Final = (1.2, 9.0)  # Length of a bar (m).

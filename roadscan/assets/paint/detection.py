@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 
 from roadscan.assets.judgement.judge import Judge
@@ -19,9 +18,7 @@ from roadscan.assets.paint.crosswalks import Bar, crosswalk_bars, is_round
 from roadscan.assets.paint.road_direction import RoadDirection
 from roadscan.assets.paint.stripes import AROUND_M, Stripe, stripes_of
 from roadscan.assets.scene import Scene
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from roadscan.compute.array_types import Int64
 
 PAINT: Final = Judge("paint", "07f605e84c1e9659")
 """Whether a component is paint."""

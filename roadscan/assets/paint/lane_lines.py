@@ -16,8 +16,7 @@ from roadscan.assets.kind import AssetObject
 from roadscan.assets.paint.chains import Bands, Run, joined
 from roadscan.assets.paint.double_lines import paired
 from roadscan.assets.paint.patterns import Stretch, patterned
-
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 _SHORTEST_M: Final = 1.0
 """Isolated paint shorter than this (m) is no line."""

@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.assets.paint.detection import Paint
 from roadscan.assets.paint.stripes import Stripe
 from roadscan.assets.scene import Box, Scene
-
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 LINE_PIECES: Final = pa.schema(
     [

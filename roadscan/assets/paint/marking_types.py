@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 _MARKER_M: Final = 0.30  # Largest marker (m).
 _BAR_ALONG_M: Final = (0.15, 1.0)  # Extent of a bar along the road (m).

@@ -13,8 +13,6 @@ from roadscan.assets.kind import AssetObject
 from roadscan.assets.paint.contrast import CELL_M
 from roadscan.assets.paint.marking_types import type_of
 
-Float64 = npt.NDArray[np.float64]
-
 _TOUCHING_M: Final = 0.03  # Pieces this near to one another (m) touch.
 _LINE_HALF_M: Final = 0.1  # Half width of lines that are cut off a marking (m).
 _BAR_GAP_M: Final = 1.2

@@ -8,9 +8,8 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 _LONGEST_DASH_M: Final = 8.0  # Longest dash (m).
 _WORN_GAP_M: Final = 2.0

@@ -6,15 +6,12 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.assets.paint.components import SEED_CONTRAST, Component
 from roadscan.assets.paint.contrast import CELL_M, Contrast
 from roadscan.assets.paint.road_direction import RoadDirection
 from roadscan.assets.quantiles import median
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from roadscan.compute.array_types import Float64, Int64
 
 CHUNK_M: Final = 5.0
 """Long components are cut at multiples of this in the map (m), so that each piece is straight."""

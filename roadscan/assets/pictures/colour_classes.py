@@ -9,10 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.pictures.reader import CutOut
+from roadscan.compute.array_types import Float64, UInt8
 from roadscan.core.extras import cv2
-
-Float64 = npt.NDArray[np.float64]
-UInt8 = npt.NDArray[np.uint8]
 
 HUES: Final = {"red": (340.0, 14.0), "orange": (14.0, 40.0), "yellow": (40.0, 70.0), "green": (70.0, 178.0),
                "blue": (178.0, 275.0), "purple": (275.0, 340.0)}  # fmt: skip

@@ -6,13 +6,10 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.assets.pictures.reader import ColourReader
+from roadscan.compute.array_types import Float64, UInt8
 from roadscan.compute.robust import scatter_about
-
-UInt8 = npt.NDArray[np.uint8]
-Float64 = npt.NDArray[np.float64]
 
 _LEAST_PLACES: Final = 5  # Least number of places of paint, and of surface.
 _BRIGHTER: Final = 1.15

@@ -7,11 +7,9 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.compute.ways import way_along
-
-Float64 = npt.NDArray[np.float64]
 
 _POINTS: Final = 48  # Points of an outline.
 

@@ -10,9 +10,8 @@ import numpy.typing as npt
 
 from roadscan.assets.pictures.plate_outlines import SHAPES, plate_outline
 from roadscan.assets.pictures.reader import CutOut
+from roadscan.compute.array_types import Float64
 from roadscan.core.extras import cv2
-
-Float64 = npt.NDArray[np.float64]
 
 _NEAR: Final = 0.07
 """Colours are compared this far within and beyond an outline, as a share of the plate."""

@@ -14,14 +14,11 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.assets.kind import AssetObject
 from roadscan.assets.object_table import reference_point
+from roadscan.compute.array_types import Float64, UInt8
 from roadscan.core.plugins import found_kinds
-
-Float64 = npt.NDArray[np.float64]
-UInt8 = npt.NDArray[np.uint8]
 
 ENTRY_POINT_GROUP: Final = "roadscan.asset_picture_readers"
 _EYE_LEVEL_M: Final = 2.0  # The sight of a tall object is no higher than this above its foot (m).

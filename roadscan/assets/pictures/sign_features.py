@@ -9,13 +9,9 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.assets.pictures.reader import CutOut
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-UInt8 = npt.NDArray[np.uint8]
+from roadscan.compute.array_types import Float64, Int64, UInt8
 
 SIDE: Final = 48  # Edge of the square (pixels).
 _AROUND: Final = 0.1  # Share of the box that is shown beyond it on each side.

@@ -21,8 +21,7 @@ import numpy.typing as npt
 from roadscan.assets.judgement.judge import stated_by
 from roadscan.assets.pictures.reader import CutOut
 from roadscan.assets.pictures.sign_features import box_px, features_of
-
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 UNKNOWN: Final = "unknown"
 """Type of a plate that pictures show and that is no listed type for sure."""

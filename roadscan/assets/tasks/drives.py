@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.assets.tasks.plan import AssetPlan
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.rig import UNMOUNTED, Mountings
 from roadscan.georeference.plan.plan import trajectory_source
 from roadscan.georeference.sensor_places import sensor_places
@@ -18,9 +18,6 @@ from roadscan.navigation.tasks.trajectories import TrajectorySource, load_trajec
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.digest import bytes_digest
 from roadscan.store.small_tables import small_path
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _TICK_NS: Final = 1_000_000_000
 """Interval of the poses that are used (ns)."""

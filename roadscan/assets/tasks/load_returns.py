@@ -18,6 +18,7 @@ from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Scene
 from roadscan.assets.statistics import Statistics
 from roadscan.assets.tiling import AssetGrid
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.grid import QUANTA_PER_M, QUANTUM_M
 from roadscan.core.ids import TileId
 from roadscan.core.rig import UNMOUNTED, Mountings
@@ -30,10 +31,6 @@ from roadscan.georeference.sources import READING_COLUMNS, Georeferencer, RawSli
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_trajectory
 from roadscan.poses.trajectory import Trajectory
 from roadscan.tiles.tasks.tile_plan import TileTask
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 _DRIVE_TICK_NS: Final = 50_000_000  # Interval of the places of a drive (ns).
 _DRIVE_STEP_M: Final = 0.25

@@ -20,6 +20,7 @@ from roadscan.assets.screens import SCREENS
 from roadscan.assets.tasks.picture_work import CUT_OUTS, SEEN, PictureTask, SquareObjects, around, rows_by_square
 from roadscan.assets.tasks.recognition import recognition_of
 from roadscan.assets.tasks.sights import best_sights, named
+from roadscan.compute.array_types import Float64
 from roadscan.core.extras import cv2
 from roadscan.core.grid import Bounds
 from roadscan.pictures.colours import ColourSource, world_places
@@ -29,8 +30,6 @@ from roadscan.run.engine.compute import reason_of
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import OutputRecord, recorded_table
 from roadscan.tiles.tasks.tiles import TaskResult
-
-Float64 = npt.NDArray[np.float64]
 
 TOLD: Final = pa.schema([("object", pa.string()), ("pictures", pa.string()), ("told", pa.string())])
 """What pictures show of objects: `told` contains columns of the kind as JSON."""

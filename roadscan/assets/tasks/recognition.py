@@ -14,11 +14,10 @@ from roadscan.assets.pictures.reader import CutOut, Recognition
 from roadscan.assets.pictures.settings import AssetPicturesSettings
 from roadscan.assets.pictures.sign_features import box_px
 from roadscan.assets.pictures.sign_types import sign_types
+from roadscan.compute.array_types import Float32
 from roadscan.core.errors import ConfigError
 from roadscan.core.extras import cv2, need, needed
 from roadscan.store.digest import file_digest
-
-Float32 = npt.NDArray[np.float32]
 
 _LEAST_TEXT_PX: Final = 24  # Smaller cut-outs (pixels) are not searched for text.
 _TEXT_PX: Final = 320

@@ -18,6 +18,7 @@ from roadscan.assets.ground.cross_sections import CrossSections, cross_sections
 from roadscan.assets.settings import GroundSectionsConfig
 from roadscan.assets.tasks.evidence import BARE_EARTH
 from roadscan.assets.tiling import AssetGrid
+from roadscan.compute.array_types import Float64
 from roadscan.condition.road_line import RoadLine
 from roadscan.condition.tasks.lines import Roads
 from roadscan.core.ids import TileId
@@ -33,8 +34,6 @@ if TYPE_CHECKING:
 
 SECTIONS: Final = "ground_sections"
 _SUFFIXES: Final = (".csv", ".dxf")
-
-Float64 = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,12 +13,10 @@ import pyarrow as pa
 from roadscan.assets.kernels.sight_lines import find_hidden
 from roadscan.assets.pictures.reader import Sight
 from roadscan.assets.screens import EDGE_M
+from roadscan.compute.array_types import Float64
 from roadscan.pictures.colours import world_places
 from roadscan.pictures.placed import Pictures
 from roadscan.pictures.views import Sights, sights
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _WALKED_M: Final = np.array([1.5, 0.8, 0.25])
 """A line of sight is tested from this far beyond the camera to this far before the object, in steps of this (m)."""

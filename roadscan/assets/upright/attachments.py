@@ -13,9 +13,7 @@ from roadscan.assets import classes
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.places import ground_light, places_of
 from roadscan.assets.upright.shafts import Shaft
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from roadscan.compute.array_types import Float64, Int64
 
 _LEVEL_M: Final = 0.4  # Height of a level of a crown (m).
 _SECTORS: Final = 8  # Directions around a shaft.

@@ -11,8 +11,7 @@ import numpy.typing as npt
 
 from roadscan.assets.kernels.cylinders import LEAST_RADIUS_M, MOST_RADIUS_M, fit_cylinder
 from roadscan.assets.quantiles import median
-
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 SECTOR_DEG: Final = 8.0
 """Sight lines within a sector (degrees) count as of one direction."""

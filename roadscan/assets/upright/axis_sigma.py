@@ -6,15 +6,12 @@ import math
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.axis import fit_axis
 from roadscan.assets.upright.shafts import LEANING_M, Shaft
 from roadscan.assets.upright.slices import SLICE_M
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from roadscan.compute.array_types import Float64, Int64
 
 _SWEEP_NS: Final = 100_000_000
 """Returns within this time (ns) share the error of their pose."""

@@ -16,8 +16,7 @@ from roadscan.assets.intensity import RANGE_NODES_M
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.slices import usable
-
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 _MIDDLES_M: Final = np.concatenate([[0.5], (RANGE_NODES_M[1:] + RANGE_NODES_M[:-1]) / 2.0, [110.0]])
 """Middles of the steps of ranges (m)."""

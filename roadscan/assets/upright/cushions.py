@@ -6,7 +6,6 @@ import math
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import shapely
 
@@ -15,9 +14,7 @@ from roadscan.assets.upright.grown import components
 from roadscan.assets.upright.panels import panels_of
 from roadscan.assets.upright.pieces import seen_by
 from roadscan.assets.upright.slices import usable
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from roadscan.compute.array_types import Int64
 
 _CELL_M: Final = 0.2  # Edge of a cell (m).
 _LOW_M: Final = 0.2  # Returns above this height (m) are used.

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.assets.kernels.corridors import mark_strip
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.lines import Chain
 from roadscan.assets.upright.places import places_of
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from roadscan.compute.array_types import Float64, Int64
 
 _BEFORE_M, _BEHIND_M = 0.4, 1.5
 """Balconies stand before the plane of a façade, windows and doors behind it, this far at the most (m)."""

@@ -16,11 +16,10 @@ from roadscan.assets.kernels.grown_cells import low_moments
 from roadscan.assets.scene import Scene
 from roadscan.assets.touching import touching
 from roadscan.assets.upright.panels import panels_of
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.extras import cv2
 from roadscan.core.strict import Strict
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 Bools = npt.NDArray[np.bool_]
 
 CELL_M: Final = 0.25  # Edge of a cell (m).

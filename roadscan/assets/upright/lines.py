@@ -14,9 +14,8 @@ from roadscan.assets.quantiles import median
 from roadscan.assets.scene import Box, Scene
 from roadscan.assets.upright.panels import Panel
 from roadscan.assets.upright.pieces import seen_by
+from roadscan.compute.array_types import Float64
 from roadscan.compute.robust import SIGMA_OF_MAD
-
-Float64 = npt.NDArray[np.float64]
 
 STRETCHES: Final = (
     "ground_m", "low_m", "high_m", "bulk_m", "length_m", "returns", "stopped", "passed", "under", "open_top", "leaves",

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.special import expit, ndtri
 
 from roadscan.assets.upright.plate_beams import Beams
-
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 _DIRECTIONS: Final = 36  # Directions in which the extent of the returns is measured.
 _TRIMMED: Final = 0.0005  # Share of the outermost returns that is left out.

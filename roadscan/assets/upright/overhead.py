@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 from pydantic import Field
 from scipy.spatial import cKDTree
@@ -17,9 +16,7 @@ from roadscan.assets.scene import Scene
 from roadscan.assets.upright.pieces import passes_of
 from roadscan.assets.upright.places import ground_light
 from roadscan.assets.upright.slices import usable
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from roadscan.compute.array_types import Float64, Int64
 
 CELL_M: Final = 0.5  # Edge of a cell (m).
 _SUPPORT_M: Final = 0.25  # Returns within this height above the lowest one support it (m).

@@ -18,9 +18,7 @@ from roadscan.assets.quantiles import median, quantiles
 from roadscan.assets.scene import Box, Scene
 from roadscan.assets.upright.places import places_of
 from roadscan.assets.upright.regions import LOWEST_M, Region, regions_of
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from roadscan.compute.array_types import Float64, Int64
 
 STRETCH_M: Final = 1.0  # Length of a stretch (m), about.
 _MOST_LINES: Final = 150_000

@@ -7,14 +7,12 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import shapely
 
 from roadscan.assets.kind import AssetObject
 from roadscan.assets.scene import Scene
-
-Int64 = npt.NDArray[np.int64]
+from roadscan.compute.array_types import Int64
 
 _COMMON: Final = (
     ("easting_m", pa.float64()), ("northing_m", pa.float64()), ("height_m", pa.float64()),

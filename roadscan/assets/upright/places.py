@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.assets import classes
 from roadscan.assets.kernels.buckets import count_buckets, fill_buckets
@@ -14,9 +13,7 @@ from roadscan.assets.memory import once_a_scene
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box, Scene
 from roadscan.assets.upright.slices import usable
-
-Int64 = npt.NDArray[np.int64]
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64, Int64
 
 _CELL_M: Final = 1.0  # Edge of a cell (m).
 

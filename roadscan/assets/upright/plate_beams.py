@@ -7,16 +7,12 @@ from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.assets.kernels.sight import Rays, rays_near
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.brightness import brightness
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
+from roadscan.compute.array_types import Bool, Float64, Int64
 
 _LEAST_COSINE: Final = 0.3
 """Least cosine between a beam and the normal: grazing beams show poorly where they meet the plane."""

@@ -16,9 +16,7 @@ from roadscan.assets.upright.brightness import brightness
 from roadscan.assets.upright.outlines import Outline
 from roadscan.assets.upright.plate_beams import Beams
 from roadscan.assets.upright.regions import regions_of
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from roadscan.compute.array_types import Float64, Int64
 
 _THIN_M, _BEHIND_M = 0.06, 0.3
 """Returns between these distances from the plane (m) are close before or behind it."""

@@ -28,10 +28,8 @@ from roadscan.assets.upright.plate_features import PlaneOfPlate, features_of
 from roadscan.assets.upright.regions import on_thin, regions_of
 from roadscan.assets.upright.shafts import shafts_of
 from roadscan.assets.upright.slices import usable
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.robust import SIGMA_OF_MAD
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _VOXEL_M: Final = 0.2  # Edge of a voxel (m).
 _THICK_M: Final = 0.06  # Greatest distance of a plate's returns from its plane (m).

@@ -15,9 +15,7 @@ from roadscan.assets.memory import once_a_scene
 from roadscan.assets.quantiles import quantiles
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.slices import usable_above_m
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from roadscan.compute.array_types import Float64, Int64
 
 SIDE_M: Final = 0.25  # Side of a voxel (m).
 LAYER_M: Final = 0.5  # Height of a voxel (m).

@@ -6,7 +6,6 @@ import math
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.assets.moving import SLOT_NS
 from roadscan.assets.quantiles import median
@@ -16,10 +15,8 @@ from roadscan.assets.upright.places import places_of
 from roadscan.assets.upright.regions import Region, regions_of
 from roadscan.assets.upright.shafts import Shaft
 from roadscan.assets.upright.slices import SLICE_M
+from roadscan.compute.array_types import Float64
 from roadscan.compute.kernel_options import read_only
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _SKIN_M: Final = 0.1
 """Returns so near to a shaft's surface (m) may lie on it: noise of ranges, bark, and steps of poses."""

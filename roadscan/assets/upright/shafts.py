@@ -16,9 +16,7 @@ from roadscan.assets.scene import Scene
 from roadscan.assets.upright.axis import Axis, fit_axis
 from roadscan.assets.upright.kernels.shafts import longest_run, near_axis, returns_about, widths_of_levels
 from roadscan.assets.upright.slices import CELL_M, LOWEST_M, SLICE_M, Slices, around, slices_of
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from roadscan.compute.array_types import Float64, Int64
 
 _LEAST_SLICES: Final = 3
 """Least number of slices of 0.2 m in which a shaft shows."""

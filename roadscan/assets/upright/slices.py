@@ -13,9 +13,7 @@ from roadscan.assets.bins import in_bins
 from roadscan.assets.kernels.slices import fill_slices, label_slices, owners
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from roadscan.compute.array_types import Float64, Int64
 
 CELL_M: Final = 0.1  # Edge of a cell (m).
 SLICE_M: Final = 0.2  # Height of a slice (m).

@@ -18,8 +18,8 @@ from roadscan.assets.upright.probability import logistic
 from roadscan.assets.upright.regions import regions_of
 from roadscan.assets.upright.shaft_features import features_of
 from roadscan.assets.upright.shafts import ALONE_M, Shaft, shafts_of
+from roadscan.compute.array_types import Int64
 
-Int64 = npt.NDArray[np.int64]
 Standing = Literal["pole", "lighting", "signal", "tree", "delineator"]
 
 POST: Final = Judge("post", "feb5bafecf6e42d0")

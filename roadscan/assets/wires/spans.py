@@ -12,9 +12,7 @@ import pyarrow as pa
 from scipy.spatial import cKDTree
 
 from roadscan.assets.quantiles import median
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from roadscan.compute.array_types import Float64, Int64
 
 _STEPS_M: Final = (1.0, 3.0)
 """A span goes on to what lies so far from its ends (m); the second step is tried where the first finds nothing."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 from scipy.spatial import cKDTree
 
@@ -14,9 +13,7 @@ from roadscan.assets.bins import in_bins
 from roadscan.assets.scene import Box, Scene
 from roadscan.assets.upright.pieces import seen_by
 from roadscan.assets.wires.kernels.lines_through import lines_through
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
+from roadscan.compute.array_types import Int64
 
 CUBE_M: Final = 0.25
 """Edge of a cube (m). Cubes lie on the map's grid, so that no cut moves them."""

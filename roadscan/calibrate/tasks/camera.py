@@ -23,6 +23,7 @@ from roadscan.calibrate.chessboard import (
 from roadscan.calibrate.estimator import Prior
 from roadscan.calibrate.evidence import Traverse
 from roadscan.calibrate.resection import Exposure, Measured, Resection, Target, project, resect
+from roadscan.compute.array_types import Float64
 from roadscan.core.camera import Interior
 from roadscan.core.errors import ConfigError, FormatError, RunError, nearest
 from roadscan.core.extras import cv2
@@ -40,8 +41,6 @@ from roadscan.store.logs import LogRecord
 from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.store import Store
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 Grey = npt.NDArray[np.uint8]
 
 PICTURES: Final = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")

@@ -17,6 +17,7 @@ from roadscan.colours.gains import BRIGHT, DARK, PictureSample, cells_of, is_com
 from roadscan.colours.kernels.looks import Camera, Depths, Limits, look
 from roadscan.colours.normals import normals_of
 from roadscan.colours.tasks.plan import DEPTHS, Batch, ColourPlan, reach_beyond_m
+from roadscan.compute.array_types import Float32, Float64, Int64, UInt8
 from roadscan.core.extras import cv2
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.grid import QUANTUM_M
@@ -28,11 +29,6 @@ from roadscan.store.manifest import OutputRecord, recorded_table
 from roadscan.store.store import Store
 from roadscan.tiles.tasks.tile_files import publish_file
 from roadscan.tiles.tasks.tile_plan import TileTask
-
-Float32 = npt.NDArray[np.float32]
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-UInt8 = npt.NDArray[np.uint8]
 
 _IMAGES: Final = ("nearest", "farthest", "moved")
 _TABLE: Final = pa.schema(

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.colours.gains import gains_of
 from roadscan.colours.tasks.depths import read_samples
 from roadscan.colours.tasks.plan import DEPTHS, ColourPlan
+from roadscan.compute.array_types import Float64
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.digest import bytes_digest
@@ -20,8 +20,6 @@ from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.store.writer import parquet_bytes
-
-Float64 = npt.NDArray[np.float64]
 
 GAINS: Final = "picture_gains"
 _DIGITS: Final = 3

@@ -6,22 +6,19 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.colours.kernels.looks import Depths
 from roadscan.colours.painting import Palette
 from roadscan.colours.tasks.depths import Shown, read_shown
 from roadscan.colours.tasks.gains import PictureGains
 from roadscan.colours.tasks.plan import DEPTHS, ColourPlan, numbers_near
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.grid import Bounds
 from roadscan.pictures.placed import Pictures
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.store import Store
-
-Int64 = npt.NDArray[np.int64]
-Float64 = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,12 +12,12 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.errors import ConfigError
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.formats.scanners.scans import GEOMETRY_KEY
 from roadscan.ingest.array_files import (
     ClockLike,
-    Float64,
     WrittenLog,
     epochs_gps_ns,
     float_array,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.crs import (
     LOCAL_WORLD,
     HeightKind,
@@ -29,7 +30,7 @@ from roadscan.core.frames import (
 )
 from roadscan.formats.trajectories.level_poses import ANGLE_SIGMAS, ATTITUDE, SIGMAS, position_of
 from roadscan.formats.trajectories.trajectory_table import BATCH_ROWS, FRAME_KEY
-from roadscan.ingest.array_files import ClockLike, Float64, WrittenLog, epochs_gps_ns, float_array, parquet_file
+from roadscan.ingest.array_files import ClockLike, WrittenLog, epochs_gps_ns, float_array, parquet_file
 from roadscan.ingest.reading.columns import ColumnOption, Found, Quantity, find_columns
 from roadscan.ingest.reading.poses import ANGLE_MAX_RAD, North
 from roadscan.ingest.reading.stamps import TIME

@@ -6,13 +6,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64
 from roadscan.compute.robust import SIGMA_OF_MAD
 from roadscan.core.clock_evidence import USUAL_DRIFT, Drift
-
-Bool = npt.NDArray[np.bool_]
-Float64 = npt.NDArray[np.float64]
 
 _OUTLIER: Final = 4.0
 """Differences beyond this many σ are outliers."""

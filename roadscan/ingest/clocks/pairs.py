@@ -6,16 +6,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.clock_evidence import USUAL_DRIFT, Drift
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.ingest.clocks.correction import ClockCorrection, Residuals
 from roadscan.ingest.clocks.lines import Line, robust_line
-
-Bool = npt.NDArray[np.bool_]
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _WINDOWS: Final = (8, 64)  # fewest and most windows into which arrivals are divided
 _IN_A_WINDOW: Final = 20  # arrivals per window within these limits

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Int64
 from roadscan.core.clock_evidence import PairEvidence
 from roadscan.core.errors import ConfigError, FormatError, RoadscanError, TimeSystemError
 from roadscan.core.gpstime import NS_PER_S, UNIT_NS, WEEK_S, Clock, TimeSystem
@@ -21,8 +21,6 @@ from roadscan.core.survey import ClockConfig, LogConfig, Survey
 from roadscan.ingest.clocks.pairs import PairFit, Pairs, clock_from_arrivals, clock_from_pairs
 from roadscan.ingest.reading.stamps import CALENDAR_SCALES, parse_calendar
 from roadscan.store.digest import file_digest
-
-Int64 = npt.NDArray[np.int64]
 
 _WEEK_NS: Final = WEEK_S * NS_PER_S
 _MOST_NS: Final = 1 << 61  # larger values are refused: sums of two such still fit into 64 bits

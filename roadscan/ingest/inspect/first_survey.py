@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Int64
 from roadscan.core.errors import ConfigError
 from roadscan.core.gpstime import NS_PER_S, WEEK_S, TimeSystem
 from roadscan.core.rig import SensorKind
@@ -26,8 +26,6 @@ from roadscan.ingest.inspect.file_kinds import FileKind, kind_of
 from roadscan.ingest.inspect.inspect import Inspection, LogReport, Progress, inspect
 from roadscan.ingest.inspect.provisional import Need, Stated, raw_stamps_ns, sensor_kind
 from roadscan.ingest.reading.format import Contents, LogFormat, Part
-
-Int64 = npt.NDArray[np.int64]
 
 WHOLE_BYTES: Final = 1 << 28
 """Logs up to this size are read to their end, so that their time span is known; of others only the beginning."""

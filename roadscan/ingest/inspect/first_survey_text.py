@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import pyproj
 from pyproj.aoi import AreaOfInterest
 from pyproj.database import query_utm_crs_info
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.crs import LOCAL_WORLD, crs_from_text
 from roadscan.core.errors import ConfigError
 from roadscan.core.frames import DIRECTIONS
@@ -32,8 +32,6 @@ from roadscan.ingest.inspect.log_figures import Extent
 from roadscan.ingest.inspect.provisional import Need
 from roadscan.ingest.reading.format import LogFormat, Part
 from roadscan.store.codecs.picture_tags import tags_in_words
-
-Float64 = npt.NDArray[np.float64]
 
 RIG_NAME: Final = "RIG.toml"
 _WIDTH: Final = 110  # characters of a comment line

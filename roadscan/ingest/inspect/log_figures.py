@@ -16,6 +16,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyproj
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.crs import LOCAL_WORLD, MapFrame, crs_from_text, geodetic_from_world
 from roadscan.core.errors import RoadscanError, SchemaError
 from roadscan.core.gpstime import NS_PER_S
@@ -25,9 +26,6 @@ from roadscan.ingest.reading.future_times import FutureTimes
 from roadscan.poses.leaps import FASTEST_M_PER_S
 from roadscan.store.readings.returns import distances_m
 from roadscan.store.schema import TableSchema, table_schema
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 LEAP_SPEED_M_PER_S: Final = FASTEST_M_PER_S
 """A position leaps where a survey vehicle would have to drive faster than this (m/s)."""

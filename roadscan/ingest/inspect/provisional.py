@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any, Final, Literal, get_args
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Int64
 from roadscan.core.crs import LOCAL_WORLD, Geoid, HeightKind, MapFrame, crs_from_text
 from roadscan.core.errors import ConfigError, CrsError, FormatError, Missing, RoadscanError, TimeSystemError
 from roadscan.core.gpstime import (
@@ -38,7 +38,6 @@ from roadscan.core.survey import ClockConfig
 from roadscan.core.toml_text import UNKNOWN, UNKNOWN_DATE, toml
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Rows
 
-Int64 = npt.NDArray[np.int64]
 Dimension = Literal["clock", "crs", "height", "options", "proposal", "sensor"]
 
 SENSOR_KINDS: Final[dict[str, SensorKind]] = {

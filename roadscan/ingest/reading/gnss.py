@@ -11,18 +11,15 @@ from dataclasses import dataclass, replace
 from typing import Final, Literal, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.crs import LOCAL_WORLD, crs_from_text, geodetic_from_world, world_frame_of
 from roadscan.core.errors import ConfigError, CrsError, Missing, TimeSystemError
 from roadscan.core.gpstime import WEEKS_A_ROLLOVER, Clock, TimeSystem
 from roadscan.ingest.reading.format import Item, LogSource
 from roadscan.ingest.reading.poses import BlockPlacer, Placement, WorldPlacement, block_rows, check_sigmas
 from roadscan.ingest.reading.records import Sieve
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 QUALITIES: Final = (
     "none", "fixed", "float", "sbas", "dgps", "ppp", "pps", "single", "dead_reckoning", "manual", "simulated",

@@ -23,6 +23,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyproj
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.crs import (
     LOCAL_WORLD,
     Geoid,
@@ -40,8 +41,6 @@ from roadscan.core.gpstime import Clock
 from roadscan.ingest.reading.format import Item, LogSource, Rows
 from roadscan.ingest.reading.records import EpochReader, Sieve, drop_failing
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 Index = Int64 | slice
 
 North = Literal["true", "grid"]

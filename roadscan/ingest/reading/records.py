@@ -14,6 +14,7 @@ from typing import Final, Self, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.errors import RoadscanError, TimeSystemError
 from roadscan.core.gpstime import (
     EARLIEST_GPS_NS,
@@ -27,10 +28,6 @@ from roadscan.core.gpstime import (
 )
 from roadscan.core.strict import Strict
 from roadscan.ingest.reading.format import LogSource, Reject
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 LEAP_NS: Final = 10 * NS_PER_S
 """A stamp farther than this outside its two neighbours is damage, not a late record."""

@@ -17,6 +17,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.errors import FormatError, Missing, TimeSystemError
 from roadscan.core.gpstime import NS_PER_S, UNIT_NS, WEEKS_A_ROLLOVER, Clock, TimeSystem, leap_seconds_at_unix
 from roadscan.core.witness import Witness
@@ -24,9 +25,6 @@ from roadscan.ingest.reading.columns import Found, Quantity, need_stamp_unit
 from roadscan.ingest.reading.format import LogSource
 from roadscan.ingest.reading.records import Sieve
 from roadscan.ingest.reading.text_table import Kind, TextBlock, TextLayout, first_fields, is_number, stamp_kind
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 TIME: Final = Quantity(
     "time", "time",

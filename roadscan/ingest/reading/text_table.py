@@ -26,15 +26,13 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.csv as pa_csv
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.core.strict import Strict
 from roadscan.core.witness import Witness
 from roadscan.ingest.reading.format import Reject
 from roadscan.ingest.reading.later_headers import AGAIN, Headers, NameLines
 from roadscan.ingest.reading.unpacked import is_unpacked, open_unpacked
-
-Int64 = npt.NDArray[np.int64]
-Float64 = npt.NDArray[np.float64]
 
 BLOCK_BYTES: Final = 1 << 20  # bytes of a block of text
 LINE_BYTES_MAX: Final = 1 << 16

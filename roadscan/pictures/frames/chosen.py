@@ -6,17 +6,14 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.errors import RoadscanError
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
 from roadscan.navigation.tasks.taken_pictures import TakenPictures, taken_pictures
 from roadscan.navigation.tasks.trajectories import load_recorded
 from roadscan.pictures.settings import VideoFramesConfig
-
-Int64 = npt.NDArray[np.int64]
-Float64 = npt.NDArray[np.float64]
 
 FRAMES: Final = "video_frames"
 """Product of the manifest: a file a key frame."""

@@ -7,13 +7,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.pictures.lens import projected, straightened
 from roadscan.pictures.settings import PictureTarget, PictureTargetsConfig
 from roadscan.pictures.views import Lens, Views
-
-Float64 = npt.NDArray[np.float64]
 
 _SIGMAS: Final = 3.0  # errors of the stated poses that are searched (σ)
 _NEAREST_M: Final = 0.5  # targets nearer than this are not looked for

@@ -10,12 +10,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float32, Float64
 from roadscan.core.extras import cv2
 from roadscan.pictures.targets.aim import Aim, Eye, Pose
 from roadscan.pictures.targets.shapes import Shape
-
-Float32 = npt.NDArray[np.float32]
-Float64 = npt.NDArray[np.float64]
 
 _HALF_PX: Final = (6.0, 8.0)
 """Half an edge of a target in the straightened picture: as many pixels as it has, within these limits."""

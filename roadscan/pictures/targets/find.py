@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float32, Float64
 from roadscan.pictures.files import read_picture
 from roadscan.pictures.placed import Pictures
 from roadscan.pictures.settings import PictureTargetsConfig
@@ -20,8 +20,6 @@ from roadscan.pictures.targets.shapes import Shape
 from roadscan.store.codecs.image_files import ImageError
 from roadscan.store.schema import table_schema
 
-Float32 = npt.NDArray[np.float32]
-Float64 = npt.NDArray[np.float64]
 Read: TypeAlias = Callable[[int], Float32 | None]
 """Returns the grey values (height, width) of a picture by its number; None where it cannot be read."""
 

@@ -14,12 +14,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Float32, Float64
 from roadscan.core.extras import cv2
 from roadscan.pictures.targets.aim import Eye, Pose, across
 from roadscan.pictures.targets.candidates import Candidate
-
-Float32 = npt.NDArray[np.float32]
-Float64 = npt.NDArray[np.float64]
 
 _LARGEST_PX: Final = 56.0
 """A target larger than this is reduced before it is fitted (pixels)."""

@@ -9,9 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import erf
 
+from roadscan.compute.array_types import Float64
 from roadscan.pictures.settings import PictureTarget, TargetStyle
-
-Float64 = npt.NDArray[np.float64]
 
 _FIELD: Final = 0.85
 """Part of a chequered target that is compared, in half edges: its outline belongs to what is around it."""

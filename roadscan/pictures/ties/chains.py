@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.pictures.lens import rays_of
 from roadscan.pictures.ties.tracks import places_of, spread, tracks_of, widest_parallax_rad
 from roadscan.pictures.ties.work import (
@@ -28,10 +28,6 @@ from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 CHAINS: Final = "picture_chains"
 TRACKS: Final = "picture_tracks"

@@ -8,13 +8,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float32, Int64, UInt8
 from roadscan.core.extras import cv2
 from roadscan.pictures.ties.sky import is_at, sky_of
-
-Float32 = npt.NDArray[np.float32]
-UInt8 = npt.NDArray[np.uint8]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 DESCRIPTOR: Final = 128
 """Numbers of a descriptor."""

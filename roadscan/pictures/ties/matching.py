@@ -6,15 +6,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float32, Float64, Int64, UInt8
 from roadscan.pictures.ties.features import FARTHEST
-
-Float64 = npt.NDArray[np.float64]
-Float32 = npt.NDArray[np.float32]
-Int64 = npt.NDArray[np.int64]
-UInt8 = npt.NDArray[np.uint8]
-Bool = npt.NDArray[np.bool_]
 
 _RATIO: Final = 0.85
 """Distance to the best descriptor over that to the second best in the band, at most; Lowe (2004) takes 0.8 over all."""

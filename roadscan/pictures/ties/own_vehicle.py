@@ -13,17 +13,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Bool, Int64
 from roadscan.pictures.exposures import Exposures
 from roadscan.pictures.lens import pixels_of, rays_of
 from roadscan.pictures.ties.features import Features, alike
 from roadscan.pictures.views import Lens
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 OWN_VEHICLE: Final = "picture_own_vehicle"
 CELLS: Final = (20, 32)

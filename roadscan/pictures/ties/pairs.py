@@ -6,14 +6,11 @@ from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.pictures.exposures import Exposures
 from roadscan.pictures.settings import PictureTiesConfig
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
 
 _SAME_VISIT_NS: Final = 20 * NS_PER_S
 """Pictures of one camera so near in time (ns) are neighbours; later ones are a revisit."""

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float32, Float64, Int64
 from roadscan.core.extras import cv2
 from roadscan.pictures.files import read_picture
 from roadscan.pictures.kernels.patch_matching import match_patches
@@ -29,10 +29,6 @@ from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
-
-Float64 = npt.NDArray[np.float64]
-Float32 = npt.NDArray[np.float32]
-Int64 = npt.NDArray[np.int64]
 
 REFINED: Final = "picture_refined"
 _BLUR_PX: Final = 0.8  # Smoothing of the pictures (1 σ, px): interpolation between sharp pixels draws places to them.

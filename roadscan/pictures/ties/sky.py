@@ -12,10 +12,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, UInt8
 from roadscan.core.extras import cv2
-
-UInt8 = npt.NDArray[np.uint8]
-Bool = npt.NDArray[np.bool_]
 
 _WIDTH_PX: Final = 320  # Width of the reduced picture (px).
 _STRENGTHS: Final = (8, 12, 16, 24, 32, 48, 64, 96, 128)

@@ -6,11 +6,8 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
+from roadscan.compute.array_types import Bool, Float64, Int64
 
 _CELLS: Final = (10, 6)
 """Columns and rows of a picture's cells over which tie points are spread."""

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
 from roadscan.navigation.tasks.pose_sigma import usual_pose_sigma
@@ -33,10 +33,6 @@ from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.store.writer import parquet_bytes
-
-Float64 = npt.NDArray[np.float64]
-Int64 = npt.NDArray[np.int64]
-Bool = npt.NDArray[np.bool_]
 
 FEATURES: Final = "picture_features"
 MATCHES: Final = "picture_matches"

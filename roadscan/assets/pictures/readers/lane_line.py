@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 
 from roadscan.assets.kind import AssetObject
 from roadscan.assets.pictures.paint_colours import PaintReader
 from roadscan.assets.pictures.reader import ColourPlaces
-
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 _STEP_M: Final = 0.5  # Distance of places along a line (m).
 _MOST_PLACES: Final = 400  # Places of a line, at most.

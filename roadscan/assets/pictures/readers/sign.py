@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.assets.calibration import Curve
 from roadscan.assets.kind import AssetObject
@@ -15,8 +14,7 @@ from roadscan.assets.pictures.colour_classes import colour_of
 from roadscan.assets.pictures.plate_outlines import on_plate, plate_axes, plate_outline
 from roadscan.assets.pictures.plate_shapes import plate_odds, shape_of
 from roadscan.assets.pictures.reader import CutOut, CutOutReader, Recognition, Sight
-
-Float64 = npt.NDArray[np.float64]
+from roadscan.compute.array_types import Float64
 
 _MOST: Final = 0.999  # Greatest probability that is stated.
 _BOX: Final = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])  # Corners of a plate of 1 by 1: right, up.

@@ -16,8 +16,8 @@ from roadscan.adjust.process import GaussMarkov, RunPrior
 from roadscan.adjust.solver_settings import AdjustmentSettings
 from roadscan.adjust.tasks.lidar_errors import lidar_error_findings, lidar_error_lines
 from roadscan.adjust.tasks.mountings import Mounted
-from roadscan.adjust.tasks.walls import lean_findings, leans
 from roadscan.adjust.ties.tie import LASERS, PLANE
+from roadscan.adjust.walls import lean_findings, leans
 
 MOUNTED = Mounted((), {("drive", "lidar"): None}, frozenset(), common_sigma=(0.01, math.radians(0.1)))  # type: ignore[dict-item]
 OFFS_M = np.random.default_rng(3).normal(0.0, 0.01, 16)  # of the lasers, as their σ says

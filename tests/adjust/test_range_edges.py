@@ -6,15 +6,18 @@ Pictures and returns are cast here, ray by ray, onto boxes on a road; nothing of
 from __future__ import annotations
 
 import functools
+import itertools
 
 import numpy as np
 import numpy.typing as npt
 import pytest
+from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
 from roadscan.adjust.adjustment import adjust
 from roadscan.adjust.bundle.edge_boresight import EdgeBoresight, Sighted, boresight_of, edge_observations
 from roadscan.adjust.bundle.range_edges import EdgeScores, scores_of
+from roadscan.adjust.kernels.range_edges import continued, scores_of_turns
 from roadscan.adjust.process import CameraPrior, GaussMarkov, MountingPrior, RunPrior
 from roadscan.adjust.solver_settings import AdjustmentSettings
 from roadscan.adjust.tasks.edge_scores import boresight_findings
@@ -134,3 +137,32 @@ def test_a_boresight_that_edges_contradict_is_told(found: EdgeBoresight) -> None
     (said,) = boresight_findings([exact])
     assert said.subject == "camera"
     assert f"heading {np.degrees(found.turn[2]):+.3f}°" in said.text
+
+
+def test_a_plane_goes_on_with_its_inverse_depth_and_an_edge_does_not() -> None:
+    """A row of returns on a plane, of which the last is nearer."""
+    tangent = np.column_stack([np.arange(5) * 0.1, np.zeros(5)])
+    inverse = 0.1 + 0.2 * tangent[:, 0]
+    inverse[4] = 0.5
+    starts, beside = np.array([0, 1, 3, 5, 7, 8]), np.array([1, 0, 2, 1, 3, 2, 4, 3])
+    first, second = np.array([1, 2, 3, 0]), np.array([2, 3, 4, 1])
+    found = continued(starts, beside, tangent, inverse, first, second)
+    np.testing.assert_allclose(found[:3], 0.1 + 0.2 * tangent[2:5, 0])
+    assert found[3] == inverse[0]  # nothing lies on its other side: it goes on as it is
+
+
+def test_scores_are_those_of_linear_interpolation() -> None:
+    """SciPy interpolates the same responses at the places to which each turn moves the edges."""
+    rng = np.random.default_rng(8)
+    response = rng.uniform(size=(2, 20, 30)).astype(np.float32)
+    place, slope = rng.uniform([-2.0, -2.0], [32.0, 22.0], (60, 2)), rng.normal(0.0, 3.0, (60, 2, 3))
+    direction, weight = rng.integers(0, 2, 60), rng.uniform(size=60)
+    turns = (np.array([-0.1, 0.0, 0.1]), np.array([0.0, 0.2]), np.array([-0.3]))
+    found = np.empty((3, 2, 1))
+    scores_of_turns(place, slope, direction, weight, response, turns, found)
+    images = [RegularGridInterpolator((np.arange(20), np.arange(30)), one, bounds_error=False, fill_value=0.0)
+              for one in response.astype(np.float64)]  # fmt: skip
+    for at, turn in zip(np.ndindex(found.shape), itertools.product(*turns), strict=True):
+        column, row = (place + slope @ np.array(turn)).T
+        values = np.choose(direction, [image(np.column_stack([row, column])) for image in images])
+        assert found[at] == pytest.approx(weight @ values, rel=1e-6)

@@ -69,8 +69,8 @@ from roadscan.adjust.tasks.tie_depths import RETURNS
 from roadscan.adjust.tasks.tie_work import TIES, KnownTies, TieTask, collect_ties, load_ties, tie_tasks
 from roadscan.adjust.tasks.ties_again import Again, first_ties, settled
 from roadscan.adjust.tasks.tracks import adjusted_sources, runs_of, tracks_of
-from roadscan.adjust.tasks.walls import lean_findings, leans
 from roadscan.adjust.tie_settings import PlaceSettings
+from roadscan.adjust.walls import lean_findings, leans
 from roadscan.compute.array_types import Float64
 from roadscan.core.counted import counted as count_of
 from roadscan.core.counted import listed
@@ -303,7 +303,7 @@ def adjust_survey(session: Session) -> None:
     filmed = [] if solution.pictures is None else list(residuals_of(solution.pictures))
     keep_pictures(session.store, manifest, key, (_picture(plan, work, tables), shown, filmed), seen.rows)
     lines = [*_lines(work, again, evidence, solution, held, tables), *mounting_lines(solution.mountings), *not_drawn]
-    doubts += lean_findings(leans(evidence.ties.columns, work.tracks, evidence.runs), evidence.runs)
+    doubts += lean_findings(leans(again.ties.columns, work.tracks, evidence.runs), evidence.runs)
     if solution.common is not None:
         lines += lidar_error_lines(solution.common, evidence.runs, collector.mounted)
         doubts += lidar_error_findings(solution.common, evidence.runs, collector.mounted)

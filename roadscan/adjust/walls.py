@@ -17,6 +17,7 @@ import numpy.typing as npt
 from roadscan.adjust.places import Track
 from roadscan.adjust.ties.tie import PLANE
 from roadscan.compute.array_types import Float64
+from roadscan.compute.robust import scatter_about
 from roadscan.core.witness import Finding, Witness
 
 _STEEP_RAD: Final = np.radians(6.0)
@@ -40,7 +41,6 @@ _DOUBTED: Final = 3.0
 _ROUNDS: Final = 20  # of weights; they settle in about ten
 _NEAR: Final = 2.0  # Spread of the walls' leans beyond which one loses its weight (Cauchy's function, squared).
 _LEAST_SPREAD_RAD: Final = 1e-4  # of walls without any noise
-_NORMAL: Final = 1.4826  # σ of a normal distribution over its median absolute value
 _NAMES: Final = ("place", "first_epoch_gps_ns", "easting_m", "northing_m", "direction_down", "first_by_right")
 
 WALLS: Final = Witness(
@@ -104,7 +104,7 @@ def _robust(design: Float64, observed: Float64) -> tuple[float, float, int]:
     values = np.zeros(2)
     for _ in range(_ROUNDS):
         residual = np.abs(observed - design @ values)
-        spread = max(_NORMAL * float(np.median(residual)), _LEAST_SPREAD_RAD)
+        spread = max(scatter_about(residual, 0.0), _LEAST_SPREAD_RAD)
         weight = (1.0 + (residual / (_NEAR * spread)) ** 2) ** -2.0
         prior = np.diag([0.0, (spread / _BACK_RAD) ** 2])
         inverse = np.linalg.inv(design.T @ (weight[:, None] * design) + prior)

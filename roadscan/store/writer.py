@@ -18,7 +18,6 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from roadscan.compute.kernels.profile_bounds import range_bounds
@@ -287,9 +286,8 @@ def _parted(schema: TableSchema, rows: pa.Table) -> tuple[pa.Table, pa.RecordBat
     if schema.partition_s is None:
         return rows, None
     ordered = sorted_rows(schema, rows)
-    epochs = ordered.column("epoch_gps_ns")
-    latest = pc.greater(epochs, pa.scalar(epochs[-1].as_py() - _LATE_NS, epochs.type))
-    count = ordered.num_rows - int(pc.sum(latest).as_py())
+    epochs = ordered.column("epoch_gps_ns").to_numpy()
+    count = int(np.searchsorted(epochs, epochs[-1] - _LATE_NS, side="right"))
     if count == 0:
         return rows, None
     # A slice would keep all rows in memory.

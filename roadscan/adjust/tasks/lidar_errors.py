@@ -10,14 +10,9 @@ import numpy.typing as npt
 
 from roadscan.adjust.adjustment import CommonErrors
 from roadscan.adjust.observations import COMMON, MOUNTED
-from roadscan.adjust.tasks.mountings import Mounted
+from roadscan.adjust.tasks.mountings import CHANCE, DETERMINED, Mounted
 from roadscan.adjust.ties.tie import LASERS
 from roadscan.core.witness import Finding, Witness
-
-_DETERMINED: Final = 0.7
-"""An error whose σ fell below this share of its prior is determined: its variance is halved."""
-_CHANCE: Final = 0.0027
-"""Chance that any error of a survey without faults is named: that of 3 σ of one."""
 
 LASER_RANGES: Final = Witness(
     "laser_ranges_of_ties",
@@ -31,7 +26,7 @@ LASER_RANGES: Final = Witness(
 SEEMING_ROLL: Final = Witness(
     "seeming_roll",
     input="rig file",
-    fault="A lidar's boresight, or all poses of a drive, are rolled by more than is stated.",
+    fault="The ties of one drive fit best with a lasting roll: poses, mounting or ranges of the lidar are off.",
     asks="planes that the lidar saw again within the same drive",
     does="the roll moves no pose and no reading; one beyond the σ of `sigma_seeming_roll_deg` is named",
     told=("findings",),
@@ -72,8 +67,9 @@ def common_errors(
 def lidar_error_lines(found: CommonErrors, runs: Sequence[str], mounted: Mounted) -> list[str]:
     """Returns a line on the lasers of each sensor, and one on the roll of each drive, as far as ties determine them."""
     laser_m, roll_deg = mounted.common_sigma[0], np.degrees(mounted.common_sigma[1])
-    known, lines = found.sigma < _DETERMINED, list[str]()
-    for k, sensor in enumerate(mounted.sensors):
+    sensors, first_run = mounted.sensors, LASERS * len(mounted.sensors)
+    known, lines = found.sigma < DETERMINED, list[str]()
+    for k, sensor in enumerate(sensors):
         own = known & (found.number // LASERS == k)
         if own.any():
             error = 1e3 * laser_m * found.error[own]
@@ -83,9 +79,9 @@ def lidar_error_lines(found: CommonErrors, runs: Sequence[str], mounted: Mounted
                 f"{np.sqrt((error**2).mean()):.1f} mm RMS, "
                 f"the most {error[most]:+.1f} mm (laser {int(found.number[own][most]) % LASERS})"
             )
-    own = known & (found.number >= LASERS * len(mounted.sensors))
+    own = known & (found.number >= first_run)
     for number, error, sigma in zip(found.number[own], found.error[own], found.sigma[own], strict=True):
-        run = runs[int(number) - LASERS * len(mounted.sensors)]
+        run = runs[int(number) - first_run]
         lines.append(
             f"roll that the ties within run '{run}' seem to show, which moves no pose: {roll_deg * error:+.3f}° "
             f"(σ {roll_deg * sigma:.3f}°)"
@@ -101,16 +97,17 @@ def lidar_error_findings(found: CommonErrors, runs: Sequence[str], mounted: Moun
     from scipy.special import ndtri
 
     laser_m, roll_deg = mounted.common_sigma[0], np.degrees(mounted.common_sigma[1])
-    shown, known = np.sqrt(np.maximum(1.0 - found.sigma**2, 0.0)), found.sigma < _DETERMINED
-    limit = -ndtri(0.5 * _CHANCE / max(int(known.sum()), 1))
+    sensors, first_run = mounted.sensors, LASERS * len(mounted.sensors)
+    shown, known = np.sqrt(np.maximum(1.0 - found.sigma**2, 0.0)), found.sigma < DETERMINED
+    limit = -ndtri(0.5 * CHANCE / max(int(known.sum()), 1))
     off = known & (np.abs(found.error) > limit * shown)
     said = []
     for number, error, sigma in zip(found.number[off], found.error[off], found.sigma[off], strict=True):
         sensor, laser = divmod(int(number), LASERS)
-        if sensor < len(mounted.sensors):
+        if number < first_run:
             said.append(
                 LASER_RANGES.finds(
-                    mounted.sensors[sensor],
+                    sensors[sensor],
                     f"ranges of laser {laser} are off by {1e3 * laser_m * error:+.1f} mm "
                     f"(σ {1e3 * laser_m * sigma:.1f} mm) against those of the others, where "
                     f"{1e3 * laser_m:.0f} mm are stated (sigma_laser_m); its returns are used as they are: look at "
@@ -120,10 +117,11 @@ def lidar_error_findings(found: CommonErrors, runs: Sequence[str], mounted: Moun
         else:
             said.append(
                 SEEMING_ROLL.finds(
-                    f"run '{runs[int(number) - LASERS * len(mounted.sensors)]}'",
+                    f"run '{runs[int(number) - first_run]}'",
                     f"its lidar sees planes again as if all were rolled by {roll_deg * error:+.2f}° (σ "
                     f"{roll_deg * sigma:.2f}°), where {roll_deg:.2f}° are stated (sigma_seeming_roll_deg); nothing is "
-                    "corrected by it: check the boresight's roll in the rig file, and that of the poses",
+                    "corrected by it: check the mounting in the rig file, the poses, and the calibration of "
+                    "the lidar",
                 )
             )
     return said

@@ -40,8 +40,10 @@ _NAMES: Final = (
 )  # fmt: skip
 DOUBTED: Final = 3.0
 """A mounting that is off by more than this many stated σ is reported."""
-_CHANCE: Final = 0.0027
-"""Chance of the test of stated mountings: that of 3 σ."""
+CHANCE: Final = 0.0027
+"""Chance of a test of what is stated: that of 3 σ."""
+DETERMINED: Final = 0.7
+"""A component whose σ fell below this share of the stated one is determined: its variance is halved."""
 _MOST_WRONG: Final = 3
 """If more sensors are wrong at once, all are estimated instead of searching which."""
 _FREE: Final = 100.0
@@ -277,7 +279,7 @@ def contradicted(found: MountingErrors) -> npt.NDArray[np.bool_]:
         holding = []
         for chosen in combinations(range(count), size):
             own, known = told.explained(np.flatnonzero(np.isin(told.sensor, chosen)))
-            if fall - own <= chdtri(max(determined - known, 1.0), _CHANCE):
+            if fall - own <= chdtri(max(determined - known, 1.0), CHANCE):
                 holding.append((own, chosen))
         if holding:
             best = max(holding)[0]
@@ -307,7 +309,7 @@ def causes(found: MountingErrors) -> tuple[Cause, ...]:
     told = _Told.of(found)
     fall, determined = told.explained(np.arange(told.sensor.size), _FREE)
     each = [told.explained(np.array([k]), _FREE)[0] for k in range(told.sensor.size)]
-    enough = fall - chdtri(max(determined - 1.0, 1.0), _CHANCE)
+    enough = fall - chdtri(max(determined - 1.0, 1.0), CHANCE)
     named = []
     for k, (sensor, component) in enumerate(zip(told.sensor.tolist(), told.component.tolist(), strict=True)):
         if each[k] >= enough and max(each) - each[k] < APART:
@@ -360,8 +362,8 @@ def mounting_lines(found: MountingErrors | None) -> list[str]:
         return lines
     for k, sensor in enumerate(found.sensors):
         prior, sigma = found.prior_sigma[k], found.sigma[k]
-        known = np.flatnonzero((prior > 0.0) & (sigma < _KNOWN * prior)).tolist()
-        unknown = np.flatnonzero((prior > 0.0) & (sigma >= _KNOWN * prior)).tolist()
+        known = np.flatnonzero((prior > 0.0) & (sigma < DETERMINED * prior)).tolist()
+        unknown = np.flatnonzero((prior > 0.0) & (sigma >= DETERMINED * prior)).tolist()
         words = [f"{_NAMES[c]} {_told(found.error[k, c], c, signed=True)} (σ {_told(sigma[c], c)})" for c in known]
         words += [f"{', '.join(_NAMES[c] for c in unknown)} not determined"] if unknown else []
         lines.append(f"mounting of {_called(sensor)}: {'; '.join(words)}")
@@ -371,10 +373,6 @@ def mounting_lines(found: MountingErrors | None) -> list[str]:
 def _called(sensor: tuple[str, str]) -> str:
     run, name = sensor
     return name if run == "*" else f"{name} in run '{run}'"
-
-
-_KNOWN: Final = 0.7
-"""A component whose σ fell below this share of the stated one is determined: its variance is halved."""
 
 
 def _told(value: float, component: int, *, signed: bool = False) -> str:

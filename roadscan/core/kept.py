@@ -26,19 +26,19 @@ def kept(name: str, make: Callable[[], str]) -> str:
     file = folder / hashlib.blake2b(name.encode(), digest_size=12).hexdigest()
     with contextlib.suppress(OSError):
         sources, _, text = file.read_text(encoding="utf-8").partition("\n")
-        if sources == _sources():
+        if sources == sources_digest():
             return text
     text = make()
     scratch = file.with_suffix(f".{secrets.token_hex(4)}")
     with contextlib.suppress(OSError):
-        scratch.write_text(f"{_sources()}\n{text}", encoding="utf-8")
+        scratch.write_text(f"{sources_digest()}\n{text}", encoding="utf-8")
         scratch.replace(file)
     return text
 
 
 @functools.cache
-def _sources() -> str:
-    """Digest of the sources, and of Python's version."""
+def sources_digest() -> str:
+    """Return the digest of the sources, and of Python's version."""
     library = Path(__file__).parents[1]
     digest = hashlib.blake2b(sys.version.encode(), digest_size=8)
     for file in sorted(library.rglob("*.py")):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import json
 import sys
 from collections.abc import Iterator
 from importlib.metadata import EntryPoints, entry_points
@@ -12,6 +13,7 @@ from types import ModuleType
 from typing import Any, Final, TypeVar, cast
 
 from roadscan.core.errors import ConfigError
+from roadscan.core.kept import kept
 
 Kind = TypeVar("Kind")
 _LIBRARY: Final = Path(__file__).parents[1]  # the package folder of roadscan
@@ -46,11 +48,36 @@ def found_kinds(
     return dict(sorted(found.items()))
 
 
+def kind_named(
+    called: str, place: str, base: type[Kind] | tuple[type[Kind], ...], group: str, name: str = "name"
+) -> Any | None:
+    """Return one class of :func:`found_kinds`, or None; no module of another kind is imported where none was added.
+
+    Which module holds it is found once for the sources as they are, by importing all of them.
+    """
+    if added(group):
+        return found_kinds(place, base, group, name).get(called)
+    modules: dict[str, str] = json.loads(
+        kept(
+            f"modules of {place} by {name}",
+            lambda: json.dumps({one: k.__module__ for one, k in found_kinds(place, base, group, name).items()}),
+        )
+    )
+    if called not in modules:
+        return None
+    kinds = _kinds_in(importlib.import_module(modules[called]), base)
+    return next(kind for kind in kinds if getattr(kind, name, None) == called)
+
+
+def _kinds_in(module: ModuleType, base: Any) -> Iterator[Any]:
+    for value in vars(module).values():
+        if isinstance(value, type) and issubclass(value, base) and value.__module__ == module.__name__:
+            yield value
+
+
 def _candidates(place: str, base: Any, group: str) -> Iterator[tuple[Any, str]]:
     for module in modules_at(place):
-        for value in vars(module).values():
-            if isinstance(value, type) and issubclass(value, base) and value.__module__ == module.__name__:
-                yield value, module.__name__
+        yield from ((kind, module.__name__) for kind in _kinds_in(module, base))
     for entry in added(group):
         yield entry.load(), f"entry point {entry.value}"
 

@@ -5,28 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from roadscan.core.errors import ChangingLogError, FormatError, FullDiskError, RoadscanError, RunError, StoreError
 from roadscan.core.gpstime import TimeSystem
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
-from roadscan.ingest.epoch_order import EpochOrder
-from roadscan.ingest.far_returns import FarReturns
-from roadscan.ingest.laser_ranges import LaserRanges
-from roadscan.ingest.log_check import LogCheck, Refuses
-from roadscan.ingest.motion_checks import MotionCheck
-from roadscan.ingest.one_stamp import StandingClock
 from roadscan.ingest.overlap import reject_words
 from roadscan.ingest.place_checks import PLACED, place_faults
 from roadscan.ingest.planned_logs import Logs, PlannedLog, logs_of, plan_logs
-from roadscan.ingest.pose_checks import PoseRecords
 from roadscan.ingest.reading.format import Item, LogHeader, LogSource, Reject
-from roadscan.ingest.reading.future_times import FutureTimes
-from roadscan.ingest.repeated_profiles import RepeatedProfiles
-from roadscan.ingest.resolution import resolution_findings
 from roadscan.ingest.sources import stamp_of
-from roadscan.ingest.stray_points import CloudPoints
 from roadscan.run.engine.compute import Compute, Done, Inline
 from roadscan.run.session import Session, found_once
 from roadscan.run.telling.teller import in_this_process
@@ -41,6 +30,9 @@ from roadscan.store.logs import (
 )
 from roadscan.store.store import Store
 from roadscan.store.writer import LogWriter
+
+if TYPE_CHECKING:
+    from roadscan.ingest.log_check import LogCheck
 
 DATA_TABLES: Final = ("scans", "returns", "cloud")
 """Tables whose readings become points."""
@@ -167,6 +159,8 @@ def read_log(task: IngestTask, folder: Path) -> tuple[LogWriter, LogHeader]:
     for check in checks:
         check.finish(writer, header)
         writer.finish()
+    from roadscan.ingest.resolution import resolution_findings
+
     writer.findings += resolution_findings(writer, header, task.log.source)
     _check_unchanged(task.log)
     return writer, header
@@ -285,6 +279,18 @@ def _items(log: PlannedLog, header: LogHeader) -> Iterator[Item]:
 
 def _checks(source: LogSource, header: LogHeader) -> list[LogCheck]:
     """Return the checks that follow the rows of a log, in the order in which they run."""
+    # Here, since `status` and `sql` import this module for its plan alone.
+    from roadscan.ingest.epoch_order import EpochOrder
+    from roadscan.ingest.far_returns import FarReturns
+    from roadscan.ingest.laser_ranges import LaserRanges
+    from roadscan.ingest.log_check import Refuses
+    from roadscan.ingest.motion_checks import MotionCheck
+    from roadscan.ingest.one_stamp import StandingClock
+    from roadscan.ingest.pose_checks import PoseRecords
+    from roadscan.ingest.reading.future_times import FutureTimes
+    from roadscan.ingest.repeated_profiles import RepeatedProfiles
+    from roadscan.ingest.stray_points import CloudPoints
+
     free = source.clock is not None and source.clock.system is TimeSystem.FREE
     poses = PoseRecords()
     return [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import json
 import os
@@ -12,8 +13,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from roadscan.core.errors import FormatError, StoreError
+from roadscan.core.kept import sources_digest
+from roadscan.core.plugins import added
 from roadscan.ingest.inspect.diagnosis import cannot_be_opened, claimed_format, is_there
-from roadscan.ingest.reading.format import LogFormat, format_named
+from roadscan.ingest.reading.format import ENTRY_POINT_GROUP, LogFormat, format_alone
 from roadscan.store.checked_json import checked_json, parse_checked
 from roadscan.store.digest import digest_holds, file_digest
 from roadscan.store.store import Store
@@ -45,6 +48,7 @@ class Sources:
         self._before = _renamed(self._kept, folder)
         self._now: dict[str, Any] = {}
         self._begun: dict[Path, Future[Known]] = {}
+        self._claims: dict[str, str] = {}
 
     def format(self, path: Path, stated: str | None) -> LogFormat:
         """Return the format of a log: as stated, as remembered, or found from its bytes."""
@@ -60,7 +64,12 @@ class Sources:
             if is_there(path) or self._name(path) not in self._before:
                 raise cannot
             stated = stated or str(self._before[self._name(path)]["format"])
-        return format_named(stated) if stated else claimed_format(path)
+        if stated:
+            return format_alone(stated)
+        claimed = claimed_before(path, self._before.get(self._name(path)))
+        found = format_alone(claimed) if claimed else claimed_format(path)
+        self._claims[self._name(path)] = claims_digest()
+        return found
 
     def begin(self, path: Path, format_: LogFormat, companions: list[Path]) -> dict[str, Future[Known]]:
         """Start to fingerprint a log's files and companions in threads; return the results by file name."""
@@ -86,7 +95,8 @@ class Sources:
         stamp as of :func:`stamp_of`.
         """
         files = {name: future.result() for name, future in begun.items()}
-        self._now[self._name(path)] = {"format": format_.name, "files": files}
+        name = self._name(path)
+        self._now[name] = {"format": format_.name, "files": files, "claims": self._claims.get(name, "")}
         combined = hashlib.blake2b(digest_size=16)
         for name, (_, _, digest) in files.items():
             combined.update(f"{name}\0{digest}\n".encode())
@@ -142,10 +152,31 @@ def _renamed(known: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     return named | {path: of for path, of in known.items() if not Path(path).is_absolute()}
 
 
-def remembered_formats(store: Store, folder: Path) -> dict[str, str]:
-    """Return the formats of logs that the store knows, by :func:`listed_name`: such a log may have moved away."""
+def remembered_logs(store: Store, folder: Path) -> dict[str, Any]:
+    """Return what the store knows of logs, by :func:`listed_name`: such a log may have moved away."""
     known, _ = _remembered(store)
-    return {path: str(of["format"]) for path, of in _renamed(known or {}, folder).items()}
+    return _renamed(known or {}, folder)
+
+
+def claimed_before(path: Path, known: Mapping[str, Any] | None) -> str | None:
+    """Return the one format that claimed the content of a file, where neither it nor any format has changed since.
+
+    All formats are imported to ask them, which takes as long as a short command.
+    """
+    if known is None or known["claims"] != claims_digest() or known["files"].keys() != {""}:
+        return None
+    try:
+        stat = path.stat()
+    except OSError:
+        return None
+    return str(known["format"]) if [stat.st_size, stat.st_mtime_ns] == list(known["files"][""][:2]) else None
+
+
+@functools.cache
+def claims_digest() -> str:
+    """Return the digest of all code that claims logs: roadscan's own, and the formats of other packages."""
+    others = sorted(f"{one.dist and one.dist.version}\0{one.value}" for one in added(ENTRY_POINT_GROUP))
+    return hashlib.blake2b("\n".join([sources_digest(), *others]).encode(), digest_size=8).hexdigest()
 
 
 def stamp_of(path: Path, format_: LogFormat, companions: list[Path]) -> str:
@@ -201,7 +232,10 @@ def _remembered(store: Store) -> tuple[dict[str, Any] | None, bool]:
     for path in (_SOURCES, _COPY):
         try:
             known = parse_checked(store.read_bytes(path))
-            logs = {log: {"format": of["format"], "files": dict(of["files"])} for log, of in known.items()}
+            logs = {
+                log: {"format": of["format"], "files": dict(of["files"]), "claims": of.get("claims", "")}
+                for log, of in known.items()
+            }
         except (StoreError, ValueError, KeyError, TypeError, AttributeError):
             continue
         return logs, path == _SOURCES

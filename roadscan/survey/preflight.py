@@ -46,8 +46,8 @@ from roadscan.ingest.one_stamp import one_stamp_logs
 from roadscan.ingest.overlap import Fault, NothingPlacedError, no_row
 from roadscan.ingest.place_checks import without_fix
 from roadscan.ingest.planned_logs import CONTROL_RUN, log_options, log_source, plan_logs
-from roadscan.ingest.reading.format import LogFormat, LogHeader, LogSource, Reject, Rows, format_named
-from roadscan.ingest.sources import listed_name, remembered_formats
+from roadscan.ingest.reading.format import LogFormat, LogHeader, LogSource, Reject, Rows, format_alone
+from roadscan.ingest.sources import claimed_before, listed_name, remembered_logs
 from roadscan.navigation.odometry.registration import LIBRARY, WHAT
 from roadscan.navigation.tasks.clocks import check_clocks
 from roadscan.navigation.tasks.navigation_logs import unknown_imu, unknown_way
@@ -131,12 +131,12 @@ class Asked:
     @cached_property
     def logs(self) -> list[CheckedLog]:
         """Logs of the survey file with their headers."""
-        moved = remembered_formats(self.store, self.survey.folder)
+        known = remembered_logs(self.store, self.survey.folder)
         listed: list[tuple[str, LogConfig | ControlConfig]] = [
             (run.id, log) for run in self.survey.config.runs for log in run.logs
         ]
         listed += [(CONTROL_RUN, control) for control in self.survey.config.control]
-        return [_checked(self.survey, run, config, moved) for run, config in listed]
+        return [_checked(self.survey, run, config, known) for run, config in listed]
 
     @cached_property
     def beginnings(self) -> list[_Beginning]:
@@ -755,17 +755,19 @@ def _map_words(asked: Asked) -> str:
     return f"map.crs '{asked.survey.config.map.crs}'" + (f" ({area.name.split('. ')[0].rstrip('.')})" if area else "")
 
 
-def _checked(survey: Survey, run: str, config: LogConfig | ControlConfig, moved: dict[str, str]) -> CheckedLog:
+def _checked(survey: Survey, run: str, config: LogConfig | ControlConfig, logs: Mapping[str, Any]) -> CheckedLog:
     """Open a log up to its header."""
     path = survey.resolve(config.path)
-    if not is_there(path) and (known := moved.get(listed_name(path, survey.folder))) is not None:
-        return CheckedLog(run, config, path, format_named(config.format or known))
+    known = logs.get(listed_name(path, survey.folder))
+    if not is_there(path) and known is not None:
+        return CheckedLog(run, config, path, format_alone(config.format or known["format"]))
     format_: LogFormat | None = None
     source: LogSource | None = None
     try:
         if cannot := cannot_be_opened(path):
             raise cannot
-        format_ = format_named(config.format) if config.format else claimed_format(path)
+        stated = config.format or claimed_before(path, known)
+        format_ = format_alone(stated) if stated else claimed_format(path)
         options = log_options(survey, config, format_, path)
         source = log_source(survey, config, path, format_, options)
         for file in format_.companions(path, options):

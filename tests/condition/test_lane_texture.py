@@ -14,8 +14,8 @@ from roadscan.condition.kernels.intensity_means import mean_intensities
 from roadscan.condition.kernels.lane_texture import FIGURES, INTENSITY, SHARE, TEXTURE, texture_of_squares
 from roadscan.condition.kernels.sampling import MOST_CELLS, Cells, CellTable, gather
 from roadscan.condition.on_lane.lines import lane_lines
-from roadscan.condition.on_lane.ravelling import RavelledSection, lane_levels, ravelled_section
-from roadscan.condition.on_lane.squares import TextureSquares, texture_squares
+from roadscan.condition.on_lane.ravelling import lane_levels, ravelled_section
+from roadscan.condition.on_lane.squares import RavelledSection, TextureSquares, texture_squares
 from roadscan.condition.profiles.tables import mean_profile_depth
 from roadscan.condition.profiles.texture import texture_segments
 from tests.condition.lane_cells import LaneOfCells

@@ -15,9 +15,11 @@ import pyarrow.parquet as pq
 import pytest
 from blake3 import blake3
 
-from roadscan.core.errors import RunError, StoreError
+from roadscan.core.errors import ConfigError, RunError, StoreError
 from roadscan.core.survey import Survey
 from roadscan.ingest.ingest import ingest
+from roadscan.ingest.reading.format import format_alone, known_format, log_formats
+from roadscan.ingest.sources import claimed_before, remembered_logs
 from roadscan.run.engine.compute import Compute, Done, Inline, R, T
 from roadscan.run.session import Session
 from roadscan.store.digest import digest_holds, file_digest
@@ -181,6 +183,34 @@ def test_a_store_with_older_digests_stays_sound_and_current(tmp_path: Path) -> N
     content = store.read_bytes(damaged)
     store.write_bytes(damaged, content[:50] + bytes([content[50] ^ 1]) + content[51:])
     assert [f.split(":")[0] for f in verify_store(store)] == [damaged]
+
+
+def test_a_log_is_claimed_anew_where_it_or_the_code_changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A format that was stated claims nothing: who takes the statement away wants the content to be asked."""
+    survey_of(tmp_path, 2)
+    with (tmp_path / "SURVEY.toml").open("a", encoding="utf-8") as file:
+        file.write('\nformat = "scans"\n')  # of the second log
+    survey, store = Survey.load(tmp_path / "SURVEY.toml"), Store(str(tmp_path / "store"), "s")
+    ingest(survey, store)
+    known = remembered_logs(store, survey.folder)
+    first, second = tmp_path / "0.arrow", tmp_path / "1.arrow"
+    assert claimed_before(first, known["0.arrow"]) == "scans"
+    assert claimed_before(second, known["1.arrow"]) is None
+    with monkeypatch.context() as patch:
+        patch.setattr("roadscan.ingest.sources.claims_digest", lambda: "another code")
+        assert claimed_before(first, known["0.arrow"]) is None
+    os.utime(first, ns=(0, 0))
+    assert claimed_before(first, known["0.arrow"]) is None
+    first.unlink()
+    assert claimed_before(first, known["0.arrow"]) is None
+
+
+def test_a_format_found_alone_is_the_one_among_all() -> None:
+    for name, one in log_formats().items():
+        assert type(known_format(name)) is type(one)
+    assert known_format("no_such_format") is None
+    with pytest.raises(ConfigError, match=r"unknown format 'sbett'.*sbet"):
+        format_alone("sbett")
 
 
 def test_a_disk_that_cannot_read_a_log_costs_that_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

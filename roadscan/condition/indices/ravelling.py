@@ -26,8 +26,7 @@ import numpy.typing as npt
 from roadscan.condition.index import ConditionIndex, Quantity, Value
 from roadscan.condition.lane_data import LaneData
 from roadscan.condition.of_sections.whole_sections import noisy
-from roadscan.condition.on_lane.ravelling import RavelledSection, lane_levels, ravelled_section
-from roadscan.condition.on_lane.squares import TextureSquares
+from roadscan.condition.on_lane.squares import RavelledSection, TextureSquares
 
 _CM3_PER_M2: Final = 1e3
 """Volume per area (cm³/m²) of a mean depth of a millimetre."""
@@ -55,6 +54,8 @@ class Ravelling(ConditionIndex):
 
 def looked_through(lane: LaneData) -> list[RavelledSection]:
     """Return each section of a lane with its patches."""
+    from roadscan.condition.on_lane.ravelling import lane_levels, ravelled_section  # slow to import
+
     if lane.config.heights == "surface":
         none = RavelledSection((), 0.0, 0.0, math.nan, "the reconstructed surface has no texture")
         return [none] * len(lane.sections_m)

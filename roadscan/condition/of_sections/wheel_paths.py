@@ -16,8 +16,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import scipy.ndimage
-from scipy.special import ndtr
 
 from roadscan.compute.array_types import Float64
 from roadscan.condition.lane_data import LaneData, Profile
@@ -83,6 +81,8 @@ class WheelPath:
         added = np.zeros((NOISES, self.profile.height_m.size))
         if not self.walls:
             return added
+        from scipy.special import ndtr
+
         share = ndtr(_drawn(_WALL_STREAM + first_stream, _numbers(self.profile, self.spacing_m), 0))
         for wall in self.walls:
             height = self.profile.height_m[wall]
@@ -112,6 +112,8 @@ class WheelPath:
         """Return (k, n) heights with the short waves restored that their window took; unchanged beside gaps."""
         if not self.window_m2:
             return height_m
+        import scipy.ndimage
+
         at, window = _window(max(math.sqrt(6.0 * self.window_m2), 1.5 * self.spacing_m), self.spacing_m)
         window /= window.sum()
         scale = self.window_m2 / float(np.sum(window * at * at))
@@ -153,6 +155,8 @@ def _well_measured(part: Profile, gap_m: float) -> Profile:
     known = np.flatnonzero(np.isfinite(part.sigma_m))
     if known.size < 2:
         return part
+    import scipy.ndimage
+
     sigma = np.interp(part.distance_m, part.distance_m[known], part.sigma_m[known])
     size = 2 * math.ceil(gap_m / float(np.median(np.diff(part.distance_m)))) + 1
     usual = scipy.ndimage.median_filter(sigma, size, mode="nearest")

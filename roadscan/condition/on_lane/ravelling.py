@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Final, Literal, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import scipy.ndimage
@@ -14,7 +13,7 @@ import shapely
 
 from roadscan.compute.array_types import Bool, Float64
 from roadscan.compute.robust import SIGMA_OF_MAD, scatter_about
-from roadscan.condition.on_lane.squares import SQUARE_M, TextureSquares
+from roadscan.condition.on_lane.squares import SQUARE_M, RavelledPatch, RavelledSection, TextureSquares
 
 LEAST_RATIO: Final = 1.15
 """Least ratio of a square's texture to its section's; it also exceeds it by :data:`_SIGMAS` of the section's spread."""
@@ -36,47 +35,6 @@ _SOUND_ROWS: Final = 0.5
 """Least share of such rows in a section that has lost stones and is not of another surface."""
 _CROSS: Final = scipy.ndimage.generate_binary_structure(2, 1)  # Neighbours by edges.
 _SQUARE: Final = scipy.ndimage.generate_binary_structure(2, 2)  # Also by corners.
-
-
-@dataclass(frozen=True, eq=False)
-class RavelledPatch:
-    """A patch that has lost stones."""
-
-    outline: shapely.Geometry
-    """Of its squares: station along the reference line, and offset from the lane's middle (m), positive to the right in
-    the direction of travel."""
-    area_m2: float
-    sigma_area_m2: float
-    """1 σ: the border may lie anywhere within a square's width; errors along it are taken as fully correlated."""
-    texture_mm: float
-    """Root mean square texture, median of its squares."""
-    ratio: float
-    """Ratio of that to the texture of the section."""
-    sigma_ratio: float
-    """1 σ from the spread of its squares."""
-    loss_mm: float
-    """Mean depth of lost material over its area, above that of the section; NaN where unknown."""
-    contrast: float
-    """Share by which its intensity is higher than that of the section; NaN without intensities."""
-    severity: str
-    evidence: Literal["texture", "texture and intensity"]
-
-
-@dataclass(frozen=True, eq=False)
-class RavelledSection:
-    """A section of a lane that was searched for patches."""
-
-    patches: tuple[RavelledPatch, ...]
-    measured_m2: float
-    """Area of its squares whose texture was judged."""
-    share: float
-    """Share of that in the area of all squares."""
-    background_mm: float
-    """Texture of its undamaged squares: the median of all, or that of the lane."""
-    reason: str = ""
-    """Reason why it was not judged."""
-    remark: str = ""
-    """Remark on the result."""
 
 
 class Level(NamedTuple):

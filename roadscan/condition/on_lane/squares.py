@@ -1,11 +1,12 @@
-"""Texture of a lane from cells, by squares of 0.2 m."""
+"""Texture of a lane from cells, by squares of 0.2 m, and the patches of lost stones that are found in them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
+import shapely
 
 from roadscan.compute.array_types import Float64
 from roadscan.condition.kernels.lane_texture import (
@@ -54,6 +55,47 @@ class TextureSquares:
         own = (self.station_m >= from_m) & (self.station_m < to_m)
         held = {one.name: getattr(self, one.name)[own] for one in fields(self) if one.name != "offset_m"}
         return replace(self, **held)
+
+
+@dataclass(frozen=True, eq=False)
+class RavelledPatch:
+    """A patch that has lost stones."""
+
+    outline: shapely.Geometry
+    """Of its squares: station along the reference line, and offset from the lane's middle (m), positive to the right in
+    the direction of travel."""
+    area_m2: float
+    sigma_area_m2: float
+    """1 σ: the border may lie anywhere within a square's width; errors along it are taken as fully correlated."""
+    texture_mm: float
+    """Root mean square texture, median of its squares."""
+    ratio: float
+    """Ratio of that to the texture of the section."""
+    sigma_ratio: float
+    """1 σ from the spread of its squares."""
+    loss_mm: float
+    """Mean depth of lost material over its area, above that of the section; NaN where unknown."""
+    contrast: float
+    """Share by which its intensity is higher than that of the section; NaN without intensities."""
+    severity: str
+    evidence: Literal["texture", "texture and intensity"]
+
+
+@dataclass(frozen=True, eq=False)
+class RavelledSection:
+    """A section of a lane that was searched for patches."""
+
+    patches: tuple[RavelledPatch, ...]
+    measured_m2: float
+    """Area of its squares whose texture was judged."""
+    share: float
+    """Share of that in the area of all squares."""
+    background_mm: float
+    """Texture of its undamaged squares: the median of all, or that of the lane."""
+    reason: str = ""
+    """Reason why it was not judged."""
+    remark: str = ""
+    """Remark on the result."""
 
 
 def columns_of(lane: Lane) -> Float64:

@@ -145,18 +145,21 @@ def _jumps_about(h: Float64, step_m: float) -> bool:
 
 def _repeated(h: Float64, step_m: float) -> Bool:
     """Return samples after the first of a run of equal heights that is too long for this road."""
-    from scipy.ndimage import maximum_filter1d, minimum_filter1d
-
     out = np.zeros(h.size, np.bool_)
     changes = np.flatnonzero(np.diff(h) != 0.0)
     first, behind = np.concatenate([[0], changes + 1]), np.concatenate([changes + 1, [h.size]])
     longest = int((behind - first).max(initial=0))
     count = _LEAST_REPEATED
+    if _TIMES * count > longest:
+        return out
+    windows = np.lib.stride_tricks.sliding_window_view(h, count)
+    high, low = windows.max(axis=1), windows.min(axis=1)
     while _TIMES * count <= longest:
-        ranges = maximum_filter1d(h, count) - minimum_filter1d(h, count)
+        ranges = high - low
         ranges = ranges[ranges > 0.0]
         if ranges.size and np.median(ranges) >= _STEPS_CHANGED * step_m:
             break
+        high, low = np.maximum(high[:-count], high[count:]), np.minimum(low[:-count], low[count:])
         count *= 2
     else:
         return out

@@ -15,8 +15,7 @@ import shapely
 
 from roadscan.condition.indices.ravelling import looked_through
 from roadscan.condition.lane_data import LaneData
-from roadscan.condition.on_lane.ravelling import RavelledPatch, RavelledSection
-from roadscan.condition.on_lane.squares import SQUARE_M
+from roadscan.condition.on_lane.squares import SQUARE_M, RavelledPatch, RavelledSection
 from roadscan.condition.tasks.values import Group, GroupTask, load_lane
 from roadscan.core.canvas import empty_figure
 from roadscan.core.extras import can_draw

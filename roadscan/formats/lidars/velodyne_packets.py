@@ -34,7 +34,6 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-import yaml
 
 from roadscan.compute.array_types import Bool, Float32, Int32, Int64
 from roadscan.compute.kernel_options import read_only
@@ -171,6 +170,8 @@ class Model:
         ConfigError
             if the file is none, or one of another sensor.
         """
+        import yaml
+
         try:
             content = yaml.safe_load(file.read_text(encoding="utf-8"))
             lasers = sorted(content["lasers"], key=lambda one: int(one["laser_id"]))

@@ -25,7 +25,7 @@ from roadscan.georeference.sources import MapSettings, RawSlice, ReadingSource, 
 from roadscan.ingest.ingest import DATA_TABLES
 from roadscan.ingest.one_stamp import one_stamp_logs
 from roadscan.ingest.overlap import Fault, NothingPlacedError, apart_logs
-from roadscan.ingest.reading.format import log_formats
+from roadscan.ingest.reading.format import known_format
 from roadscan.ingest.same_content import same_points
 from roadscan.navigation.tasks.clocks import load_clocks
 from roadscan.navigation.tasks.navigate import records_of, records_with_trajectories
@@ -175,7 +175,7 @@ class NothingToPlaceError(RunError):
 
 def yields_readings(log_format: str) -> bool:
     """Return whether logs of a format (or trajectories computed by a method) contain readings to georeference."""
-    known = log_formats().get(log_format)
+    known = known_format(log_format)
     return known is not None and not set(DATA_TABLES).isdisjoint(known.yields)
 
 

@@ -22,7 +22,7 @@ import pyarrow as pa
 from roadscan.core.crs import LOCAL_WORLD, Geoid, HeightKind, MapFrame
 from roadscan.core.errors import ConfigError, CrsError, FormatError, Missing, RoadscanError, TimeSystemError, nearest
 from roadscan.core.gpstime import Clock
-from roadscan.core.plugins import found_kinds
+from roadscan.core.plugins import found_kinds, kind_named
 from roadscan.core.rig import Sensor, SensorKind
 from roadscan.core.strict import Strict
 from roadscan.core.witness import Finding, Witness
@@ -461,6 +461,17 @@ def log_formats() -> dict[str, LogFormat]:
     """Return all formats by name: those of roadscan, and installed entry points."""
     found = found_kinds("formats/**/*.py", LogFormat, ENTRY_POINT_GROUP)
     return {name: kind() for name, kind in found.items()}
+
+
+def known_format(name: str) -> LogFormat | None:
+    """Return a format by name, without importing the others; None where there is none of that name."""
+    kind = kind_named(name, "formats/**/*.py", LogFormat, ENTRY_POINT_GROUP)
+    return None if kind is None else kind()
+
+
+def format_alone(name: str) -> LogFormat:
+    """Return a format by name as :func:`format_named` does, without importing the others where it is known."""
+    return known_format(name) or format_named(name)
 
 
 def format_named(name: str) -> LogFormat:

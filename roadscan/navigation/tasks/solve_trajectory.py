@@ -22,9 +22,6 @@ from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.core.ids import of_run
 from roadscan.core.survey import Survey
 from roadscan.ingest.clocks.correction import ClockCorrection
-from roadscan.navigation.inertial.adaptive import solve_adaptively
-from roadscan.navigation.inertial.checks import prepared
-from roadscan.navigation.inertial.motion import ned_from_world
 from roadscan.navigation.inertial.readings import GnssSolutions, Innovations, Solution, VehicleSensors
 from roadscan.navigation.tasks.clock_tables import load_clocks
 from roadscan.navigation.tasks.computed_trajectory import Computed, Rows, sigma_figures, table_rows, trajectory_rows
@@ -72,6 +69,9 @@ class PlannedSolution:
         """
         logs, clocks, survey = self.logs, dict(self.clocks), self.survey
         settings = survey.config.navigation.smoother
+        from roadscan.navigation.inertial.adaptive import solve_adaptively  # not for `sql`, which plans alone
+        from roadscan.navigation.inertial.checks import prepared
+
         vehicle = vehicle_sensors(survey.rig, logs)
         wheel = logs.encoder[0].sensor if logs.encoder else ""
         imu, gnss, odometer, repairs = prepared(
@@ -236,6 +236,8 @@ class Residuals:
 
 def residuals_of(solution: Solution, gnss: GnssSolutions, vehicle: VehicleSensors) -> Residuals:
     """Return residuals of the GNSS positions within the trajectory's pieces that state a covariance."""
+    from roadscan.navigation.inertial.motion import ned_from_world
+
     epochs = gnss.epochs_gps_ns
     first, last = int(solution.epochs_gps_ns[0]), int(solution.epochs_gps_ns[-1])
     pieces = solution.pieces or ((first, last),)

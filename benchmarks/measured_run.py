@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -21,6 +22,7 @@ from roadscan.compute.kernels.processor import compiles_for
 from tests.kernels.test_plain_processor import AVX2
 
 _EVERY_S = 0.05
+_GROUPS = Path("/sys/fs/cgroup/cpu")
 _WORKER_MARK = "multiprocessing.spawn"
 """In the command line of Dask's workers."""
 
@@ -33,6 +35,8 @@ class Way:
     """Class of processor that kernels are compiled for; the machine's own where it is empty."""
     products: tuple[str, ...] = ()
     """What :mod:`benchmarks.pipeline` is asked for."""
+    share: float = 0.0
+    """Share of a core that each worker may use; all that there is where it is 0."""
 
     @property
     def environment(self) -> dict[str, str]:
@@ -112,7 +116,7 @@ def measured_in_turns(
 def _one_run(survey: BenchSurvey, store: Path, workers: int, way: Way) -> dict[str, Any]:
     command = [sys.executable, "-m", "benchmarks.pipeline", str(survey.file), str(store), str(workers), *way.products]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=way.environment) as process:
-        watch = _Watch(process.pid)
+        watch = _Watch(process.pid, way.share)
         watch.start()
         out, _ = process.communicate()
         watch.stop()
@@ -125,9 +129,10 @@ def _one_run(survey: BenchSurvey, store: Path, workers: int, way: Way) -> dict[s
 class _Watch(threading.Thread):
     """Looks at a process and its children until it is stopped, and keeps the largest resident memory of each."""
 
-    def __init__(self, pid: int) -> None:
+    def __init__(self, pid: int, share: float) -> None:
         super().__init__(daemon=True)
         self._pid = pid
+        self._share = share
         self._over = threading.Event()
         self._peak_bytes: dict[int, int] = {}
         self._workers: set[int] = set()
@@ -157,9 +162,23 @@ class _Watch(threading.Thread):
         try:
             self._peak_bytes[process.pid] = max(self._peak_bytes.get(process.pid, 0), _peak_rss(process))
             if process.pid != self._pid and _WORKER_MARK in " ".join(process.cmdline()):
+                if self._share and process.pid not in self._workers:
+                    _limit(process.pid, self._share)
                 self._workers.add(process.pid)
         except (psutil.NoSuchProcess, psutil.ZombieProcess, psutil.AccessDenied):
             return
+
+
+def _limit(pid: int, share: float) -> None:
+    """Give a process this share of a core, by a control group (version 1) of its own; groups that are empty go."""
+    for old in _GROUPS.glob("roadscan-bench-*"):
+        with contextlib.suppress(OSError):  # its process is at work
+            old.rmdir()
+    group = _GROUPS / f"roadscan-bench-{pid}"
+    group.mkdir()
+    period_us = int((group / "cpu.cfs_period_us").read_text())
+    (group / "cpu.cfs_quota_us").write_text(f"{round(share * period_us)}")
+    (group / "cgroup.procs").write_text(f"{pid}")
 
 
 def _peak_rss(process: psutil.Process) -> int:

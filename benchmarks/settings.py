@@ -30,6 +30,10 @@ class Settings:
     """From profile to profile of the drives whose length grows."""
     scaling_km: str = "1,2,4,8"
     """Their lengths."""
+    workers_km: float = 100.0
+    """Length of the drive that one, two, four and eight workers do; it takes some tasks for each of eight."""
+    workers_share: float = 0.2
+    """Share of a core that each of them has."""
     network_km: float = 20_000.0
     """Length of the network whose scheduling is tried."""
     network_region_km: float = 200.0

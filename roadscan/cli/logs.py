@@ -9,6 +9,7 @@ from typing import Annotated, Final, Literal
 import typer
 
 from roadscan.cli.arguments import PlainJson, formats_for
+from roadscan.cli.arrow_alone import arrow_alone
 from roadscan.cli.terminal import looking, print_json, print_table
 
 _MOST_REJECTS: Final = 20  # messages that are listed singly
@@ -67,6 +68,7 @@ def inspect_files(
 
     Ends with 0 if all files can be read (faults of single records do not count), with 2 if one cannot.
     """
+    arrow_alone()
     from roadscan.ingest.inspect.inspect import inspect
     from roadscan.ingest.inspect.provisional import Stated, parse_clock, parse_option
 

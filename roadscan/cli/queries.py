@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from roadscan.cli.arguments import SurveyOption, SurveyOrFleet, found_survey, options_apart
+from roadscan.cli.arrow_alone import arrow_alone
 from roadscan.cli.terminal import print_table, print_whole
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ def sql(  # noqa: PLR0913  each is an option of the command
     The statement reaches the store's files and memory alone. Ends with 1 where a damaged file is missing from the
     answer, or in it.
     """
+    arrow_alone()
     from roadscan.core.errors import AnswerError, ConfigError, StoreError
     from roadscan.run.session import Session
     from roadscan.store.query.sql import Limits

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from roadscan.cli.arguments import PlainJson, SurveyFile, Workers
+from roadscan.cli.arrow_alone import arrow_alone
 from roadscan.cli.terminal import new_reporter, print_json, print_table
 
 if TYPE_CHECKING:
@@ -159,6 +160,7 @@ def _some(names: Sequence[str], count: int) -> str:
 def found_status(survey_file: Path) -> Status:
     """The state of a survey's store."""
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")  # Arrow's own keeps a third more; not loaded by now
+    arrow_alone()
     from roadscan.run.session import Session
     from roadscan.survey.status import survey_status
 

@@ -12,8 +12,7 @@ import shapely
 from roadscan.core.counted import counted
 from roadscan.core.gpstime import iso_from_gps_ns
 from roadscan.fleet.row import Row
-from roadscan.report.blocks import Block, Drawing, Line, Paragraph, Part, Table
-from roadscan.report.map_page import COLOURS, WIDTH, MapPage
+from roadscan.report.blocks import COLOURS, WIDTH, Block, Drawing, Line, MapPage, Paragraph, Part, Table
 from roadscan.report.page import html_page
 
 _STATES: Final = {"finished": COLOURS[2], "unfinished": COLOURS[5], "failed": COLOURS[1], "not run": COLOURS[6]}

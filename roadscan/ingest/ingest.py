@@ -12,10 +12,9 @@ from roadscan.core.gpstime import TimeSystem
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
 from roadscan.ingest.epoch_order import EpochOrder
-from roadscan.ingest.far_returns import FarReturns
 from roadscan.ingest.laser_ranges import LaserRanges
 from roadscan.ingest.log_check import LogCheck, Refuses
-from roadscan.ingest.motion_checks import MotionCheck
+from roadscan.ingest.motion_checks import MotionCheck, RepeatedProfiles
 from roadscan.ingest.one_stamp import StandingClock
 from roadscan.ingest.overlap import reject_words
 from roadscan.ingest.place_checks import PLACED, place_faults
@@ -23,10 +22,9 @@ from roadscan.ingest.planned_logs import Logs, PlannedLog, logs_of, plan_logs
 from roadscan.ingest.pose_checks import PoseRecords
 from roadscan.ingest.reading.format import Item, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.future_times import FutureTimes
-from roadscan.ingest.repeated_profiles import RepeatedProfiles
 from roadscan.ingest.resolution import resolution_findings
 from roadscan.ingest.sources import stamp_of
-from roadscan.ingest.stray_points import CloudPoints
+from roadscan.ingest.stray_points import CloudPoints, FarReturns
 from roadscan.run.engine.compute import Compute, Done, Inline
 from roadscan.run.session import Session, found_once
 from roadscan.run.telling.teller import in_this_process

@@ -14,8 +14,7 @@ from typing import Any, Final
 from roadscan.core.errors import FormatError, StoreError
 from roadscan.ingest.inspect.diagnosis import cannot_be_opened, claimed_format, is_there
 from roadscan.ingest.reading.format import LogFormat, format_named
-from roadscan.store.checked_json import checked_json, parse_checked
-from roadscan.store.digest import digest_holds, file_digest
+from roadscan.store.digest import checked_json, digest_holds, file_digest, parse_checked
 from roadscan.store.store import Store
 
 _SOURCES: Final = "manifest/sources.json"

@@ -24,9 +24,8 @@ from roadscan.site.parts.catalog import from_longitude_latitude, to_longitude_la
 from roadscan.site.parts.vectors import site_layers
 from roadscan.site.report_copy import REPORT, linked_report
 from roadscan.site.web_part import web_documents
-from roadscan.store.checked_json import checked_json, parse_checked
 from roadscan.store.codecs import SOFTWARE
-from roadscan.store.digest import file_digest
+from roadscan.store.digest import checked_json, file_digest, parse_checked
 from roadscan.store.holding.beside import beside, put_folder
 from roadscan.store.manifest import read_recorded
 

@@ -11,9 +11,8 @@ from weakref import WeakValueDictionary
 
 from roadscan.core.errors import DamagedError, StoreError
 from roadscan.core.witness import Finding
-from roadscan.store.checked_json import checked_json, parse_checked
 from roadscan.store.codecs.group_spans import GroupRows, GroupSpans
-from roadscan.store.digest import bytes_digest
+from roadscan.store.digest import bytes_digest, checked_json, parse_checked
 from roadscan.store.store import Store
 
 _FOLDER: Final = "manifest/logs"

@@ -14,8 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from roadscan.core.errors import DamagedError, StoreError
-from roadscan.store.checked_json import checked_json, parse_checked
-from roadscan.store.digest import bytes_hold
+from roadscan.store.digest import bytes_hold, checked_json, parse_checked
 from roadscan.store.records import RECORDS, OutputRecord, Packed, Row, latest, rows_of, sound_rows, table_of, unpacked
 from roadscan.store.store import MADE_AGAIN, Store
 

@@ -22,8 +22,7 @@ from roadscan.core.errors import DamagedError, RunError, StoreError
 from roadscan.ingest.planned_logs import logs_of
 from roadscan.ingest.sources import files_of, listed_name
 from roadscan.run.session import Session
-from roadscan.store.checked_json import checked_json, parse_checked
-from roadscan.store.digest import file_digest, stream_digest
+from roadscan.store.digest import checked_json, file_digest, parse_checked, stream_digest
 from roadscan.store.logs import has_log
 from roadscan.store.store import opened_url
 from roadscan.survey.forgotten import forgotten_pictures

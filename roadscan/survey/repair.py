@@ -17,12 +17,11 @@ from roadscan.ingest.planned_logs import PlannedLog, plan_logs
 from roadscan.ingest.sources import is_unchanged
 from roadscan.navigation.tasks.navigate import keep_trajectory, plan_trajectories
 from roadscan.store.logs import NAVIGATION, DataFile, LogRecord, read_log_records, table_of, write_log_record
-from roadscan.store.repair_records import repair_records
 from roadscan.store.salvage import Lost, read_lost, salvaged, write_lost
 from roadscan.store.schema import table_schema
 from roadscan.store.stamp import stamp_of
 from roadscan.store.store import Store
-from roadscan.store.verified import note_verified
+from roadscan.store.verified import note_verified, repair_records
 from roadscan.survey.status import find_damage
 
 

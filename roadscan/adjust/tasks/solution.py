@@ -57,7 +57,7 @@ from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
 from roadscan.navigation.tasks.pose_sigma import stated_pose_sigma
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded
 from roadscan.poses.level import level_poses
-from roadscan.poses.mounting_change import NO_SEAT
+from roadscan.poses.movement import NO_SEAT
 from roadscan.poses.trajectory import Corrections
 
 _WIDENED: Final = 3

@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from roadscan.adjust.kernels.plane_moments import add_moments, leave_out_far
+from roadscan.adjust.kernels.patch_cells import add_moments, leave_out_far
 from roadscan.adjust.patches import PassReadings, level_from_map
 from roadscan.adjust.places import Place
 from roadscan.adjust.tie_settings import TieSettings

@@ -26,7 +26,7 @@ import pyarrow as pa
 from roadscan.core.errors import FormatError, Missing, TimeSystemError
 from roadscan.core.toml_text import toml
 from roadscan.formats.lidars.returns_batch import returns_batch
-from roadscan.ingest.reading.arrow_batches import unlisted_batches, unlisted_reason
+from roadscan.ingest.reading.column_table import unlisted_batches, unlisted_reason
 from roadscan.ingest.reading.format import NO_LEVER_ARM, Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import Sieve
 from roadscan.store.damage import UNREADABLE

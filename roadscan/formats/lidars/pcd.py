@@ -28,8 +28,16 @@ from roadscan.formats.clouds.pcd_file import (
 from roadscan.formats.clouds.reference_scan import Brightness
 from roadscan.formats.lidars.returns_batch import returns_batch
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
-from roadscan.ingest.reading.point_fields import AXES, INTENSITIES, LASERS, field_named
-from roadscan.ingest.reading.records import EpochReader, Sieve, few_rejects, options_of
+from roadscan.ingest.reading.records import (
+    AXES,
+    INTENSITIES,
+    LASERS,
+    EpochReader,
+    Sieve,
+    few_rejects,
+    field_named,
+    options_of,
+)
 
 _FARTHEST_M: Final = 10_000.0  # farther positions count as damage
 _MOST_LASERS: Final = 255  # greatest number of a laser

@@ -17,14 +17,13 @@ from typing import Any, Final, NamedTuple, Self
 from roadscan.core.errors import FormatError, nearest
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.formats.lidars.pcap import Datagram
-from roadscan.formats.ros.containers.compression import ZSTD, unpack_file, unpacked
 from roadscan.formats.ros.containers.mcap_file import MAGIC as MCAP
 from roadscan.formats.ros.containers.mcap_file import McapFile
 from roadscan.formats.ros.containers.ros1_file import OLDER as ROS1
 from roadscan.formats.ros.containers.ros1_file import Ros1File
 from roadscan.formats.ros.containers.sqlite_file import MAGIC as SQLITE
 from roadscan.formats.ros.containers.sqlite_file import SqliteFile
-from roadscan.formats.ros.containers.storage import Connection, Container, MessageSpan
+from roadscan.formats.ros.containers.storage import ZSTD, Connection, Container, MessageSpan, unpack_file, unpacked
 from roadscan.formats.ros.definitions import Decode, decoder, type_name
 from roadscan.ingest.reading.format import Reject
 

@@ -16,12 +16,19 @@ from roadscan.core.gpstime import NS_PER_S, UNIT_NS
 from roadscan.core.strict import Strict
 from roadscan.core.witness import Finding, Witness
 from roadscan.formats.ros.bag import Bag, Topic, stamp_ns
-from roadscan.formats.ros.point_times import FIELDS, UNKNOWN_NS, Origin, PointTimes, Sample, found
-from roadscan.formats.ros.return_rows import INTENSITY_MAX, ReturnRows
+from roadscan.formats.ros.return_rows import (
+    FIELDS,
+    INTENSITY_MAX,
+    UNKNOWN_NS,
+    Origin,
+    PointTimes,
+    ReturnRows,
+    Sample,
+    found,
+)
 from roadscan.formats.ros.topics import Timed, TopicFormat, TopicOptions
 from roadscan.ingest.reading.format import Item, LogHeader, LogSource, Reject
-from roadscan.ingest.reading.point_fields import AXES, INTENSITIES, LASERS, field_named
-from roadscan.ingest.reading.records import options_of
+from roadscan.ingest.reading.records import AXES, INTENSITIES, LASERS, field_named, options_of
 
 _TYPES: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Number types of sensor_msgs/PointField by its constants."""

@@ -9,9 +9,8 @@ import numpy as np
 
 from roadscan.compute.array_types import Bool, Float64, Int32, Int64
 from roadscan.simulate.kernels.beams import along_beam, through
-from roadscan.simulate.kernels.chance import mixed
 from roadscan.simulate.kernels.ground import CELL_M, TILE_CELLS, TILE_M, Cells, first_ground, into_hole
-from roadscan.simulate.kernels.options import compiled, inlined, inner
+from roadscan.simulate.kernels.options import compiled, inlined, inner, mixed
 from roadscan.simulate.kernels.road import (
     DEFECTS,
     DEFECTS_END,

@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 import shapely
 
 from roadscan.inventory.homes.page_edits import LAYER
-from roadscan.site import evidence
+from roadscan.site import layer
 from roadscan.site.layer import (
     BLUE,
     GOOD_TO_POOR,
@@ -106,7 +106,7 @@ def _layer(material: Material, kind: str, held: _Rows, order: int, colour: str) 
 def _evidence(material: Material, row: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the evidence for an asset: pictures, the passes of its first and last return, its place on the strips."""
     epochs = (row.get("first_epoch_gps_ns"), row.get("last_epoch_gps_ns"))
-    return [*evidence.of_pictures(material, row), *evidence.of_passes(material, epochs), *evidence_of_row(row)]
+    return [*layer.of_pictures(material, row), *layer.of_passes(material, epochs), *evidence_of_row(row)]
 
 
 def _styles(schema: AssetSchema, width_px: float) -> Iterator[Style]:

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
-from roadscan.site import evidence
+from roadscan.site import layer
 from roadscan.site.layer import BLUE, RED, LayerKind, SiteLayer, Style, schema_columns
 from roadscan.site.material import Material
 from roadscan.store.readings.row_groups import read_groups
@@ -57,7 +57,7 @@ def _layer(material: Material, table: str, rows: pa.Table, arrows: dict[str, Any
         [*_RESIDUAL_STYLES, _STYLE] if arrows else [_STYLE],
         key="name", label="name", arrows=arrows,
         evidence=[
-            list(evidence.of_passes(material, [row.get("epoch_gps_ns")], row["run"])) if row.get("run") else []
+            list(layer.of_passes(material, [row.get("epoch_gps_ns")], row["run"])) if row.get("run") else []
             for row in rows.to_pylist()
         ],
     )  # fmt: skip

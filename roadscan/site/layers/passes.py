@@ -12,7 +12,7 @@ import shapely
 
 from roadscan.core.gpstime import utc_from_gps_ns
 from roadscan.navigation.tasks.trajectories import TrajectorySource
-from roadscan.site import evidence
+from roadscan.site import layer
 from roadscan.site.layer import (
     BLUE,
     GREEN,
@@ -72,7 +72,7 @@ class Passes(LayerKind):
         yield SiteLayer(
             about.name, about.title, about.group, about.geometry, about.order, np.array(shapes, object), rows,
             _COLUMNS, about.styles, about.key,
-            evidence=[list(evidence.of_run(material, row["run"])) for row in rows],
+            evidence=[list(layer.of_run(material, row["run"])) for row in rows],
         )  # fmt: skip
 
 

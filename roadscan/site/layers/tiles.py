@@ -11,7 +11,7 @@ import shapely
 
 from roadscan.core.errors import DamagedError, RoadscanError
 from roadscan.core.ids import TileId
-from roadscan.site import evidence
+from roadscan.site import layer
 from roadscan.site.layer import (
     BLUE,
     GREY,
@@ -68,7 +68,7 @@ class Tiles(LayerKind):
                 SiteColumn("passes", "", "Passes that saw it, separated by spaces."),
             ],
             [Style("State", 1, by="state", values=_STATES)], key="tile", visible=False,
-            evidence=[[evidence.of_pass(material, int(one)) for one in row["passes"].split()] for row in rows],
+            evidence=[[layer.of_pass(material, int(one)) for one in row["passes"].split()] for row in rows],
         )  # fmt: skip
 
 

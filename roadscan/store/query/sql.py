@@ -19,8 +19,7 @@ from roadscan.store.asset_schema import ASSET_FOLDER, asset_tables
 from roadscan.store.logs import log_of, read_log_records, table_of
 from roadscan.store.manifest import Manifest
 from roadscan.store.query.sql_files import PROTOCOL, OpenedFiles, StoreFiles, url
-from roadscan.store.readings.packed_returns import PACKED
-from roadscan.store.readings.packed_view import beams_query, returns_query
+from roadscan.store.readings.packed_returns import PACKED, beams_query, returns_query
 from roadscan.store.schema import schema_names, table_schema
 from roadscan.store.store import Store
 from roadscan.store.verified import faults_of_opened, recorded_files

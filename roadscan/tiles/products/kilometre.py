@@ -18,8 +18,7 @@ from roadscan.core.strict import Strict
 from roadscan.store.codecs.cog import Band, write_sparse_cog
 from roadscan.tiles.product import Cells, LoadCells, Output, ProductContext, SurveyProduct, TileSummary
 from roadscan.tiles.products.hillshade import SHADE_BAND, Light, base_below, shade, with_neighbours
-from roadscan.tiles.products.quantities import band_of
-from roadscan.tiles.products.raster import CellBox, about
+from roadscan.tiles.products.raster import CellBox, about, band_of
 from roadscan.tiles.products.sheets import (
     Sheet,
     check_sheet,

@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.store.codecs.choice import LIBRARY
-from roadscan.store.codecs.kernels.run_lengths import LONGEST_RUN_BYTES, encode_runs
+from roadscan.store.codecs.kernels.byte_planes import LONGEST_RUN_BYTES, encode_runs
 from roadscan.store.codecs.parquet import pages
 from roadscan.store.codecs.parquet.list_table import KINDS, Packed, Page, Writer, chunk
 from roadscan.store.codecs.parquet.thrift import Value, binary, i64, struct, varint, zigzag

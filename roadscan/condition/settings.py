@@ -1,4 +1,4 @@
-"""Settings of the road's condition (section ``[condition]`` of the survey file)."""
+"""Settings of the road's condition (section ``[condition]``), of its edges and of roughness regions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Charts approximate the map projection near the vehicle by polynomials.
+"""Charts approximate the map projection near the vehicle, and give kernels what georeferences a sensor's readings.
 
 PROJ places a million points a second; a chart places a hundred times as many. World space is cut into
 boxes of 200 m; about the centre of each box the map coordinates are expanded to second order from 19

@@ -1,4 +1,4 @@
-"""The points of one tile, from which cells and products are made."""
+"""The points of one tile, and their canonical order: equal readings give equal files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checks a log's poses for contradictions among themselves: heading, pitch, constant values, speeds, spacing and σ."""
+"""Checks for a log whose poses contradict one another, and for a scanner that repeats its profiles."""
 
 from __future__ import annotations
 

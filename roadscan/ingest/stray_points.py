@@ -1,4 +1,4 @@
-"""Finds points of a cloud that are far from all others of it, and points that occur twice."""
+"""Checks for points of a cloud far from all others, for points that occur twice, and for returns beyond any range."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Changes on the road between two survey epochs: appeared, gone, moved, changed, each with its significance.
+"""Changes on the road between two survey epochs, each with its significance, and the history of one asset.
 
 Of two surveys of ten thousand assets some differ by 3 σ by chance alone. So moves, and changed values, count where the
 expected share of false ones among them stays below 1 % (Benjamini and Hochberg 1995, J. R. Stat. Soc. B 57, 289–300).

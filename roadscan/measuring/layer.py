@@ -1,4 +1,4 @@
-"""Rows of the table `pictures`, and the files that hold them."""
+"""All pictures of a survey's cameras as rows of the table `pictures`, and the files that hold them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bounds on how far corrections move poses, within which results made from recorded poses stay valid."""
+"""Changes that an adjustment makes to mountings, and bounds on how far its corrections move poses."""
 
 from __future__ import annotations
 

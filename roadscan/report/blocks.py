@@ -1,4 +1,4 @@
-"""The contents of a report section: paragraphs, tables, pictures. The template converts them to HTML.
+"""The contents of a report section: paragraphs, tables, pictures and drawings of the map.
 
 All text is escaped by the template: names and messages come from logs and survey files.
 """

@@ -1,4 +1,4 @@
-"""Bodies of which things beside the road consist: rows of numbers for the kernels, placed on the ground."""
+"""Bodies of things beside the road and of street furniture, as rows of numbers for the kernels, and their classes."""
 
 from __future__ import annotations
 

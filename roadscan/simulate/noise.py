@@ -1,4 +1,4 @@
-"""Random numbers: an independent stream for each purpose and block, so that no result depends on chunks.
+"""Random numbers, an independent stream for each purpose and block, and the road's random unevenness from them.
 
 Random unevenness of the longitudinal profiles, and the roughness index that scales it.
 

@@ -1,4 +1,4 @@
-"""Vector layers: their description, and all kinds of them: modules of `site/layers/`, and entry points."""
+"""Vector layers of `site/layers/` and of entry points: their description, and the evidence for a feature."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Digests of files and of their bytes."""
+"""Digests of files and of their bytes, and small JSON files that bear one: damage is detected."""
 
 from __future__ import annotations
 

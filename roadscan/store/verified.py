@@ -1,4 +1,4 @@
-"""Remembers which files of SQL were verified against their records, and their stamps at that time.
+"""Remembers which files of SQL were verified against their records, and repairs damaged records.
 
 DuckDB does not verify checksums. A file whose size and time are as they were when its digest was found right was not
 written since, and checking them takes microseconds. What changed since, or was never verified, is read once.

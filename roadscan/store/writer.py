@@ -1,4 +1,4 @@
-"""Writes rows as sorted partitions of GPS time, in bounded memory.
+"""Writes rows as sorted partitions of GPS time, and merges sorted files of one partition, both in bounded memory.
 
 Computes columns from incoming rows, so that no log has to contain them.
 

@@ -1,4 +1,4 @@
-"""Normal equations of sparse observations, summed into a pattern that is known beforehand.
+"""Normal equations of sparse observations, and entries of the inverse of their matrix, both in a known pattern.
 
 A symmetric matrix is given by its upper triangle in compressed columns: `starts` (u + 1,) and `rows`, ascending within
 a column, the diagonal last. Observations are compressed rows: `first` (n + 1,), `unknown` ascending within a row, and

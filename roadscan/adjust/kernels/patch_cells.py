@@ -1,4 +1,4 @@
-"""Readings near a place as cells in the axes of the road: robust heights, and their spread."""
+"""Readings near a place as cells in the axes of the road, and moments of points about the plane of their group."""
 
 from __future__ import annotations
 

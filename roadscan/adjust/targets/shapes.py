@@ -1,4 +1,4 @@
-"""Shape and size of a control target as the survey states them."""
+"""Shape and size of a control target as the survey states them, and the intensities around a stated place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables and pictures of an adjustment: written as a whole, recorded in the manifest with its key."""
+"""Tables and pictures of an adjustment, recorded in the manifest, and pairs of runs whose ties mostly fail."""
 
 from __future__ import annotations
 

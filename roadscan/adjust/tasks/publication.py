@@ -1,4 +1,4 @@
-"""The table `corrections`: rows of this stage and of other programs, and their update by a new solution."""
+"""The table `corrections`: from a solution to its rows; those that move no pose stay bit-identical."""
 
 from __future__ import annotations
 

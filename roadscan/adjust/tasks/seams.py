@@ -1,4 +1,4 @@
-"""Seams that are drawn: the place where two passes differed most before the adjustment, and a typical one."""
+"""Seams, the surfaces of two passes at one place before and after the adjustment, and which of them are drawn."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ties of a survey: each task covers some places and writes one file of the table `ties`."""
+"""Ties of a survey, a file of the table `ties` a task, and the errors that ties of one lidar have in common."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Exact natural-neighbour interpolation (Sibson 1981) of scattered points onto a raster.
+"""Exact natural-neighbour interpolation (Sibson 1981) over a Delaunay triangulation of scattered points.
 
 A query point inserted among the points would take its Voronoi cell from those of its natural neighbours; the areas
 taken are their weights. The Delaunay triangles whose circles contain the point (Watson 1992) give the neighbours, and

@@ -1,4 +1,4 @@
-"""Heights of the road at given places, from a local surface through nearby cells of the tiles around.
+"""Heights and mean intensities of the road at given places, from the cells of the tiles around.
 
 Cells are visited by row and column of the map, whatever their tiles, so that a height has the same bits for any set of
 tiles that contains its cells.

@@ -1,4 +1,4 @@
-"""Runs tasks that make several files each: records are stored as they end, and a failed task is tried once more."""
+"""Runs tasks that make several files each, and selects the tiles beside a piece of a road."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Turns the points of messages into rows of `returns`.
+"""Turns the points of messages into rows of `returns`, and finds how a cloud states the time of each point.
 
 Finds how a cloud states the time of each point, from the size of the numbers and their span against the rate.
 

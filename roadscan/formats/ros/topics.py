@@ -1,4 +1,4 @@
-"""What the formats of a bag's topics share: which topic is read, which of its stamps count, and what watches them.
+"""What the formats of a bag's topics share: topics, stamps, blocks of messages, and messages that hold packets.
 
 Compares the stamps of messages' headers with the stamps at which the recording computer received them.
 

@@ -1,4 +1,4 @@
-"""Finds named columns with units: which column of a file is which quantity, in which unit.
+"""Finds named columns with units, and reads angles in degrees, minutes and seconds.
 
 A column is found by a name that carries its unit (``latitude_deg``, ``height_m``); any other name
 has to be mapped, with its unit, in the log's options. Nothing is guessed.

@@ -1,4 +1,4 @@
-"""Shared parts of all record readers: which records are sound, why others are not, and their epochs.
+"""Shared parts of all record readers: which records are sound, their epochs, and the names of point fields.
 
 Nothing here knows a format. A :class:`Sieve` collects the faults of a block's records, an
 :class:`EpochReader` brings a log's stamps to GPS time block by block.

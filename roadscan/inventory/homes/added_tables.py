@@ -1,4 +1,4 @@
-"""Additions by people to a GeoPackage of the inventory (layers, tables, views, styles); a publication keeps them."""
+"""What people add to a GeoPackage of the inventory, and values that are not of their column's type."""
 
 from __future__ import annotations
 

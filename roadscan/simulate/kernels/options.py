@@ -1,4 +1,4 @@
-"""Compiler options of the simulator's kernels."""
+"""Compiler options of the simulator's kernels, and random numbers by counter."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Writes the lidar's capture: packets of its maker, with what belongs beside them.
+"""Writes the captures of lidars of three makers: packets as each sends them, with the files that belong to them.
 
 Writes the capture of a PandarXT-32, and its angle file.
 

@@ -1,4 +1,4 @@
-"""Packed returns: what a lidar that fires its lasers in turn wrote of each return, and the rows of ``returns`` of it.
+"""Packed returns: what a lidar wrote of each return, and the rows of ``returns`` of it, in Python and in SQL.
 
 The positions are computed as the reader of the format computed them before such files were there, to the last bit.
 

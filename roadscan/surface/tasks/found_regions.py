@@ -1,4 +1,4 @@
-"""Regions of interest that the coarse model finds: searched in pieces of each drive, stored in the table ``regions``.
+"""Regions of the surface: those that the survey file states, and those that the coarse model of a drive shows.
 
 A piece is a span of GPS time at whole multiples of its own length, with the profiles of a few seconds before and after
 it. So a region has the same corners however the readings lie in files, and whichever worker searches it.

@@ -1,4 +1,4 @@
-"""Computes statistics of a tile's cells from its buckets, bit-identical to ``tiles.kernels.cell_statistics``.
+"""Fills a tile's buckets and computes its cells from them, bit-identical to ``tiles.kernels.cell_statistics``.
 
 Cells with similar numbers of readings are grouped wherever they lie: sixteen of up to 8, of up to 32 and of up to 64
 readings go through ``compute.kernels.column_statistics`` together. Fuller ones are processed one by one.

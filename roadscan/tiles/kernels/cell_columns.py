@@ -1,4 +1,4 @@
-"""The statistics of a tile's cells as columns, which kernels write."""
+"""The statistics of a tile's cells as columns, and those of a single cell with very many heights."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Buckets collect readings by row of cells until their tile is finished.
+"""Buckets collect readings by row of cells until their tile is finished; the tiles that are counted into.
 
 Successive readings of a rotating mirror or a lidar fall into distant cells: counted one by one, each reading would wait
 for its cell's memory. So readings are first put into the bucket of their row of cells in their tile: buckets grow at

@@ -1,4 +1,4 @@
-"""Common layout of raster products: north up, in the CRS's units, as a cloud-optimised GeoTIFF."""
+"""Layout of raster products (north up, in the CRS's units, cloud-optimised GeoTIFF), and the quantities they show."""
 
 from __future__ import annotations
 

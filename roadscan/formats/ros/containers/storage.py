@@ -1,4 +1,4 @@
-"""What the containers of a bag have in common: connections, messages, and files that consist of chunks.
+"""What the containers of a bag have in common: connections, messages, chunks and how these are unpacked.
 
 A connection is a stream of messages of one topic, one type and one definition. A chunk is a run of records that is
 compressed as a whole; the records after it say how many messages of each connection it holds.

@@ -1,4 +1,4 @@
-"""Parquet's BYTE_STREAM_SPLIT: first bytes of all values, then their second bytes, and so on (*Encodings.md*).
+"""Parquet's BYTE_STREAM_SPLIT and the runs of its RLE_DICTIONARY (*Encodings.md*).
 
 Parquet's RLE_DICTIONARY of columns that keep a value for many rows: its runs, never its bit-packed groups.
 

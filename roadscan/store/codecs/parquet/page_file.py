@@ -1,4 +1,4 @@
-"""Reads pages of Parquet files that `list_table.Writer` wrote; any other content counts as damage."""
+"""Reads Parquet files that `list_table` and `number_table` wrote; any other content counts as damage."""
 
 from __future__ import annotations
 

@@ -70,7 +70,7 @@ class InteriorOptions(Strict):
     """Largest accepted 1 σ of the focal length, as a share of it: larger where the board is never tilted."""
     least_tilt_deg: float = Field(default=15.0, ge=0.0, lt=80.0)
     """At least a third of the boards are tilted by this much against the picture's plane (degrees): from flat views
-    alone distance and focal length cannot be told apart."""
+    alone distance and focal length cannot be distinguished."""
     outlier: float = Field(default=3.0, gt=1.0)
     """Pictures with an RMS of more than this many times the usual one are left out."""
     radial: Literal[1, 2, 3] | None = None

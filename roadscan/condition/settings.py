@@ -52,7 +52,7 @@ class RoadEdgesConfig(Strict):
     reach_m: float = Field(default=6.0, ge=0.5, le=30.0)
     """How far beyond the border of the outermost lane an edge is sought (m)."""
     largest_sigma_m: float = Field(default=0.3, ge=0.05, le=2.0)
-    """Edges with a larger standard deviation are not told (m)."""
+    """Edges with a larger standard deviation are not given (m)."""
     polygons: Path | None = None
     """Layer of polygons (shapefile, GeoPackage, GeoJSON) that hold the road's surface, relative to the survey file; its
     borders are the edges, and none are sought in the readings."""

@@ -146,7 +146,7 @@ def _is_too_short(fault: Any) -> bool:
 
 
 def _is_beside(fault: Any, faults: Sequence[Any]) -> bool:
-    """Return whether a fault is implied by another one: a table's own faults, or the last missing item, say more."""
+    """Return whether a fault is implied by another one: a table's faults, or the last missing item, say more."""
     above = fault["loc"][:-1]
     if _is_too_short(fault):
         return any(_is_too_short(f) and f["loc"][:-1] == above and f["loc"][-1] > fault["loc"][-1] for f in faults)

@@ -134,7 +134,7 @@ PRODUCT: Final = "pictures"
 GEOPACKAGE: Final = "pictures.gpkg"
 _NUDGE_RAD: Final = 1e-6  # Small turn with which derivatives of angles are taken.
 _UPRIGHT_DEG: Final = 89.0
-"""Beyond this middle angle the outer two of three angles are not told apart, and have no σ."""
+"""Beyond this middle angle the outer two of three angles are not distinguished, and have no σ."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,7 +37,7 @@ class Allowance(NamedTuple):
         Between its knots the corrected trajectory is not the recorded one with a correction that is linear in time: it
         is interpolated through corrected knots. With even knots that swings over by at most 3/8 of the largest
         correction (cubic Hermite with slopes through five knots: |slope| ≤ 1.5 per knot, times u (1 − u) ≤ 1/4), with
-        uneven ones by more, where corrections change from one knot to the next by their own size. So the bound is twice
+        uneven ones by more, where corrections change from one knot to the next by their size. So the bound is twice
         the correction.
         """
         return 2.0 * (self.shift_m + self.turn_rad * arm_m)

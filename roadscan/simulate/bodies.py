@@ -118,7 +118,7 @@ def points_on(
 
 @dataclass
 class Assembly:
-    """Bodies of one thing, in its own axes: ahead along its heading, right, up from its foot (m)."""
+    """Bodies of one thing, in its axes: ahead along its heading, right, up from its foot (m)."""
 
     place: Place
     heading_rad: float

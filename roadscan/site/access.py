@@ -67,7 +67,7 @@ class Access(Strict):
     address: str
     """Where people see the page: `https://roads.example.org`. The proxy leaves out what comes after the host."""
     listen: str = "127.0.0.1"
-    """Address that the server listens on: a proxy on another host, or in a container of its own, needs `0.0.0.0`."""
+    """Address that the server listens on: a proxy on another host, or in a separate container, needs `0.0.0.0`."""
     user_header: str = "X-Forwarded-User"
     """Header in which the proxy says who asks."""
     groups_header: str = "X-Forwarded-Groups"

@@ -2,7 +2,7 @@
 
 It listens on a loopback address. It answers GET and HEAD, whole or by one range (RFC 9110, 14), for paths that the site
 names; no path reaches the file system. A request that names another host is refused, so that no page of another origin
-reads the survey by a name that resolves to this machine. Where it has doors, it answers POST from its own page: what
+reads the survey by a name that resolves to this machine. Where it has doors, it answers POST from its page: what
 changes nothing as it is, and what writes with a token that stands in no document. Behind a proxy (`access.py`), it
 answers only those whom the file of access names.
 """

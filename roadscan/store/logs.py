@@ -36,9 +36,9 @@ class DataFile:
     digest: str
     """BLAKE3-128 of its bytes with the prefix ``blake3:``; without a prefix, BLAKE2b-128 (older versions)."""
     group_rows: Sequence[int]
-    """Rows of each row group, held as :class:`GroupRows`."""
+    """Rows of each row group, stored as :class:`GroupRows`."""
     group_spans: Sequence[tuple[int, int]]
-    """First and last epoch (GPS ns) of each row group, held as :class:`GroupSpans`; empty for tables without epochs."""
+    """First and last epoch (GPS ns) of each row group (:class:`GroupSpans`); empty for tables without epochs."""
 
     def __post_init__(self) -> None:
         for name, kind in (("group_rows", GroupRows), ("group_spans", GroupSpans)):

@@ -250,7 +250,7 @@ def _listed(kept: Archive) -> dict[str, dict[str, Any]]:
 
 
 def archive_place(name: str) -> str:
-    """Return where a file lies in an archive: files outside of the survey's folder are told apart by their paths."""
+    """Return where a file lies in an archive: files outside of the survey's folder are distinguished by their paths."""
     path = PurePosixPath(name)
     if not path.is_absolute() and ".." not in path.parts:
         return name

@@ -239,7 +239,7 @@ def _points(poses: PicturePoses, frame: LocalFrame, file: Path | None) -> Float6
 
 
 def _offset(poses: PicturePoses, frame: LocalFrame) -> dict[str, Any]:
-    """Return where the local frame lies, and by how much the map's own axes differ from it."""
+    """Return where the local frame lies, and by how much the map's axes differ from it."""
     chart = poses.pictures.map
     level = map_from_ned(chart, frame.world, frame.origin_world_m[None])[0] @ ENU_FROM_NED
     eyes = frame.points(poses.pictures.views.eye_world_m)

@@ -56,7 +56,7 @@ class PcdOptions(Strict):
     """Field with the time of each point; found by itself under the usual names: t, time, timestamp, time_stamp,
     offset_time, gps_time."""
     time_from: Literal["clock", "file_name"] = "clock"
-    """What the times count from: the origin of the log's clock, in whose unit they then are; or the file's own stamp,
+    """What the times count from: the origin of the log's clock, in whose unit they then are; or the file's stamp,
     which is its name."""
     time_unit: Unit | None = None
     """Unit of the times where they count from the file's name."""

@@ -184,7 +184,7 @@ class Bag:
     def decoded(self, topic: str, decode: Decode | None = None) -> Iterator[tuple[Message, Any] | Reject]:
         """Yield each message of a topic with its content (fields as attributes, arrays of numbers as NumPy arrays).
 
-        decode : reads a message in place of the topic's own definition.
+        decode : reads a message in place of the topic's definition.
         """
         decode = decode or self.topic(topic).decoder()
         for message in self.messages(topic):
@@ -267,7 +267,7 @@ def bag_files(path: Path) -> list[Path]:
     whole = (path / METADATA).is_file()
     found = [p for p in path.iterdir() if p.is_file() and _plain(p).suffix in _SUFFIXES]
     if not whole and len({_DIGITS.sub("#", _plain(p).name) for p in found}) > 1:
-        return []  # bags of their own, in one folder
+        return []  # separate bags, in one folder
     return sorted(found, key=lambda p: [int(number) for number in _DIGITS.findall(_plain(p).stem)])
 
 

@@ -52,10 +52,10 @@ class RosPointsOptions(TopicOptions):
     time_unit: Literal["s", "ms", "us", "ns"] | None = None
     """Unit of that field; needed where the numbers leave it open."""
     time_from: Origin | None = None
-    """What that field counts from: the message's own stamp (`header`), or the origin of the clock (`epoch`); needed
+    """What that field counts from: the message's stamp (`header`), or the origin of the clock (`epoch`); needed
     where the numbers leave it open."""
     time_ahead_s: float = 0.0
-    """Seconds by which the points' own times are ahead of the headers' stamps, where both count from the origin of a
+    """Seconds by which the points' times are ahead of the headers' stamps, where both count from the origin of a
     clock: 18 (since 2017) where the points are on GPS time and the headers on UTC, 37 where they are on TAI."""
     untimed: Literal["stamp"] | None = None
     """For clouds without a time of each point: "stamp" gives every point that of its message. It is right where the

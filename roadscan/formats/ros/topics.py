@@ -261,7 +261,7 @@ class Arrivals:
     def _offset(self, late_ns: int, unix_s: int) -> str:
         """Say what a constant difference means; '' where it is the way of a message."""
         if abs(late_ns) > _OWN_COUNT_NS or self._clock.system is TimeSystem.FREE:
-            return ""  # a counter of its own, which the stated clock explains
+            return ""  # a separate counter, which the stated clock explains
         for system, ahead_s in ahead_of_utc_s(unix_s).items():
             if abs(late_ns + ahead_s * NS_PER_S) < _SAME_SCALE_NS:
                 if self._clock.system is system:
@@ -303,7 +303,7 @@ _ROOM: Final = {
     "pandar_msgs/msg/PandarScan": (1500, True),
     "hesai_lidar/msg/PandarScan": (1500, True),
 }
-"""Bytes that each packet of a message takes, and whether the packet's own length follows them."""
+"""Bytes that each packet of a message takes, and whether the packet's length follows them."""
 _HEADER: Final = 12  # bytes before the frame's name: a number or the encapsulation, and the stamp
 _LITTLE_ENDIAN: Final = 1  # second byte of the encapsulation of CDR (OMG DDSI-RTPS 2.5, 10.5)
 

@@ -327,7 +327,7 @@ def _sort_in(path: Path, found: FoundFolder, logs: list[FoundLog], progress: Pro
 def _sort_in_parts(
     container: Inspection, contents: Contents, found: FoundFolder, logs: list[FoundLog], progress: Progress
 ) -> None:
-    """Sort in each part of a container as a log of its own."""
+    """Sort in each part of a container as a separate log."""
     for part in contents.parts:
         if not part.format:
             continue
@@ -445,7 +445,7 @@ def shared_time(one: LogReport, other: LogReport) -> float:
 def _common_scale(one: LogReport, other: LogReport) -> tuple[str, list[int], list[int]] | None:
     """Return the common time scale of two logs and their spans on it; None where they have none.
 
-    Seconds of the week are compared with GPS time by its own seconds of the week.
+    Seconds of the week are compared with GPS time by its seconds of the week.
     """
     spans = [_comparable(one), _comparable(other)]
     if any(span is None for span in spans):

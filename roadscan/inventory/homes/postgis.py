@@ -83,7 +83,7 @@ class PostGis(Home):
         return self._project
 
     def layer_address(self, table: str) -> tuple[str, str]:
-        """Returns the table without user and password: QGIS asks for them, or takes them from its own store."""
+        """Returns the table without user and password: QGIS asks for them, or takes them from its store."""
         shown = " ".join(f"{k}='{self._parts[k]}'" for k in ("dbname", "host", "port") if self._parts.get(k))
         return "postgres", f'{shown} key=\'fid\' srid={self.srid} table="{self.schema}"."{table}" (geom)'
 

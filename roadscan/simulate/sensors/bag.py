@@ -2,7 +2,7 @@
 
 Vehicle and sensors have axes x ahead, y left, z up (REP 103). A cloud is a turn of the head (of a Mid-360 a frame, in
 the messages of Livox's driver); `t` counts nanoseconds from the header's stamp (as Ouster's driver writes it). Stamps
-are Unix UTC of each sensor's own clock; messages arrive late by random times, in the order of their arrival. An
+are Unix UTC of each sensor's clock; messages arrive late by random times, in the order of their arrival. An
 odometry, where the scene has one, is the pose since the start, with an error that grows with the way.
 
 Writes messages of Livox's driver (livox_ros_driver2/CustomMsg), serialised here: objects of single points are slow.

@@ -109,7 +109,7 @@ def _ends(packed: bytes) -> tuple[Int64, Int64]:
 
 
 class GroupRows(Sequence[int]):
-    """Rows of row groups, held as runs of equal ones; equal to a tuple of the same numbers."""
+    """Rows of row groups, stored as runs of equal ones; equal to a tuple of the same numbers."""
 
     __slots__ = ("_ends", "runs")
 

@@ -30,7 +30,7 @@ class Look:
         self._before = {} if before is None else before._named_contents()
         """Contents that were read before the listing, by path and ETag."""
         self._states: dict[str, str] = {}
-        """The store's own name of each content as it was listed."""
+        """The store's name of each content as it was listed."""
         self._sizes: dict[str, int] | None = None
         self._folders: Counter[str] = Counter()
         """Number of files below each folder."""

@@ -50,7 +50,7 @@ _NO_EXTENSIONS = (
 )
 """Settings that prevent downloads, confined or not; files are opened when they are used."""
 _MEMORY_SHARE: Final = "40%"
-"""DuckDB's own default is 80 %, which leaves no room for an answer beside it, nor for a run on the same machine."""
+"""DuckDB's default is 80 %, which leaves no room for an answer beside it, nor for a run on the same machine."""
 _SPILT: Final = 4
 """An unconfined statement may write so many times its memory to a temporary folder, which ends with it."""
 _BATCH_ROWS: Final = 100_000

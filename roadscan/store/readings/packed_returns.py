@@ -2,7 +2,7 @@
 
 The positions are computed as the reader of the format computed them before such files were there, to the last bit.
 
-Packed returns as rows of ``returns`` in SQL: what `packed_returns` computes, in DuckDB's own arithmetic.
+Packed returns as rows of ``returns`` in SQL: what `packed_returns` computes, in DuckDB's arithmetic.
 
 DuckDB's sine and cosine may differ from NumPy's in their last bit of 53, so that single coordinates may differ in their
 last bit of 24.

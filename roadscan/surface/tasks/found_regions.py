@@ -1,6 +1,6 @@
 """Regions of the surface: those that the survey file states, and those that the coarse model of a drive shows.
 
-A piece is a span of GPS time at whole multiples of its own length, with the profiles of a few seconds before and after
+A piece is a span of GPS time at whole multiples of its length, with the profiles of a few seconds before and after
 it. So a region has the same corners however the readings lie in files, and whichever worker searches it.
 """
 

@@ -129,7 +129,7 @@ class ChunkedContainer(Container):
         """Yield messages and connections of a chunk in their order; raises one of `BROKEN` where it is damaged."""
 
     def messages(self, wanted: Set[int]) -> Iterator[RawItem]:
-        """Yield the messages of some connections, chunk by chunk; a damaged chunk costs its own messages."""
+        """Yield the messages of some connections, chunk by chunk; a damaged chunk costs its messages."""
         with self.path.open("rb") as stream:
             for chunk in self.chunks:
                 if chunk.spans and not wanted & chunk.spans.keys():

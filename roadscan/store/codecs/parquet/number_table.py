@@ -109,7 +109,7 @@ class _Numbers(Writer):
         self._planes = np.empty(0, np.uint8)
         self._room = np.empty(0, np.uint64)
         self._epochs: tuple[Array, int, Packed] | None = None
-        """The 64-bit numbers that were packed last: a return's pose is of its own epoch mostly."""
+        """The 64-bit numbers that were packed last: a return's pose is of its epoch mostly."""
 
     def column(self, field: pa.Field, values: Array, step: float | None, stated: bool) -> Value:
         """Write a column chunk; return its part of the footer."""

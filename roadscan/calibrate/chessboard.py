@@ -205,10 +205,10 @@ def _views(
     for name, grey in pictures:
         reason, corners = "it cannot be read as a picture", None
         if grey is not None:
-            own = (grey.shape[1], grey.shape[0])
-            size = size or own
-            if own != size:
-                reason = f"it has {own[0]} × {own[1]} pixels, the first {size[0]} × {size[1]}"
+            pixels_of_file = (grey.shape[1], grey.shape[0])
+            size = size or pixels_of_file
+            if pixels_of_file != size:
+                reason = f"it has {pixels_of_file[0]} × {pixels_of_file[1]} pixels, the first {size[0]} × {size[1]}"
             else:
                 corners = find_corners(grey, board)
                 reason = f"no whole board of {board.columns} × {board.rows} inner corners was found in it"

@@ -576,12 +576,12 @@ class Survey:
         found: list[LanePass] = []
         for run in self.config.runs:
             run_id = RunId(run.id)
-            own = None if run.id in stated else PassId(next(free))
+            number = None if run.id in stated else PassId(next(free))
             if run_id not in run_spans_gps_ns:
                 continue
             first, last = run_spans_gps_ns[run_id]
-            if own is not None:
-                found.append(LanePass(own, run_id, first, last + 1))
+            if number is not None:
+                found.append(LanePass(number, run_id, first, last + 1))
                 continue
             for one in self.config.passes:
                 if one.run == run.id:

@@ -100,8 +100,8 @@ def write_rig(scene: Scene, file: Path, *, nominal: bool = True) -> None:
         lines += _sensor(name, "camera", "pinhole camera, Brown-Conrady distortion", "frd", mounted(camera.mount))
         lines += _interior(name, camera.stated() if nominal else camera)
     if scene.imu.on:
-        own, axes = scene.imu.errors is not None, "flu" if scene.bag.on else "frd"
-        lines += _sensor("imu", "imu", f"IMU, {'own' if own else scene.imu.grade} grade", axes, mounted(AT_BODY))
+        has_errors, axes = scene.imu.errors is not None, "flu" if scene.bag.on else "frd"
+        lines += _sensor("imu", "imu", f"IMU, {'own' if has_errors else scene.imu.grade} grade", axes, mounted(AT_BODY))
         lines.append(_imu_errors(scene.imu.errors or scene.imu.grade))
     for imu in head_imus(scene):
         lines += _sensor(imu.name, "imu", "IMU of a profiler head", "frd", mounted(imu.mount))

@@ -197,13 +197,13 @@ def table_layer(material: Material, table: str, about: SiteLayer) -> Iterator[Si
 
     There is none where the survey has no such rows, or where the inventory shows them with its edits.
     """
-    held = None if table in material.tables_in_inventory else material.table(table)
-    if held is None or held.shapes_m is None or not held.rows.num_rows:
+    content = None if table in material.tables_in_inventory else material.table(table)
+    if content is None or content.shapes_m is None or not content.rows.num_rows:
         return
-    names = [f.name for f in held.rows.schema if not _is_list(f)]
-    rows = held.rows.select(names).to_pylist()
+    names = [f.name for f in content.rows.schema if not _is_list(f)]
+    rows = content.rows.select(names).to_pylist()
     yield SiteLayer(
-        about.name, about.title, about.group, about.geometry, about.order, held.shapes_m, rows,
+        about.name, about.title, about.group, about.geometry, about.order, content.shapes_m, rows,
         schema_columns(table, names), about.styles, about.key, about.label, about.visible, about.arrows,
         [list(evidence_of_row(row)) for row in rows],
     )  # fmt: skip
@@ -250,8 +250,8 @@ def of_pictures(material: Material, row: Mapping[str, Any]) -> Iterator[Told]:
         names = str(one.get("run")), str(one.get("camera")), str(one.get("file"))
         url, distance = urls.get(names), one.get("distance_m")
         away = f", {distance:g} m away" if isinstance(distance, int | float) else ""
-        told = {"title": f"picture {' '.join(names)}{away}", "kind": "picture"}
-        yield told | ({} if url is None else {"url": url})
+        words = {"title": f"picture {' '.join(names)}{away}", "kind": "picture"}
+        yield words | ({} if url is None else {"url": url})
 
 
 def _pictures_named(text: Any) -> list[Mapping[str, Any]]:
@@ -265,9 +265,9 @@ def _pictures_named(text: Any) -> list[Mapping[str, Any]]:
 def of_passes(material: Material, epochs_gps_ns: Iterable[Any], run: str | None = None) -> Iterator[Told]:
     """Yield the passes at some epochs, of one run where it is named."""
     wanted = [one for one in epochs_gps_ns if isinstance(one, int)]
-    for own in material.plan.passes if wanted else ():
-        if run in (None, own.run) and any(own.start_gps_ns <= one < own.end_gps_ns for one in wanted):
-            yield of_pass(material, own.pass_id)
+    for driven in material.plan.passes if wanted else ():
+        if run in (None, driven.run) and any(driven.start_gps_ns <= one < driven.end_gps_ns for one in wanted):
+            yield of_pass(material, driven.pass_id)
 
 
 def of_pass(material: Material, number: int) -> Told:

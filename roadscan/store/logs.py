@@ -196,8 +196,8 @@ def data_file(raw: Mapping[str, Any]) -> DataFile:
 def parse_log_record(content: bytes, key: str, path: str) -> LogRecord:
     """Return the record of the log `key`, from the content of the file `path`."""
     known = (path, bytes_digest(content))
-    if (held := _HELD.get(known)) is not None:
-        return held
+    if (parsed := _HELD.get(known)) is not None:
+        return parsed
     try:
         raw = parse_checked(content)
         raw["tables"] = {name: tuple(map(data_file, files)) for name, files in raw["tables"].items()}

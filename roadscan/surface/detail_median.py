@@ -12,7 +12,7 @@ lines, as in Nieminen, Heinonen and Neuvo (1987), "A new class of detail-preserv
    49 cells around (a crack as long as a line; outliers that meet by chance make fewer), then on to neighbours above
    `edge_sigmas` twice, and one cell more for the foot of its walls.
 4. *Direction*: the one whose medians have the least risk at the 49 cells around. Risk is Stein's (1981) unbiased
-   estimate of the squared error: misfit² + 2 σ² for each cell that is the median of itself alone. Without the second term lines
+   estimate of the squared error: misfit² + 2 σ² for each cell that is its own median. Without the second term lines
    across a wall would win: their median is the cell in the middle, noise and all. A misfit is cut off at
    `outlier_sigmas`, so that outliers have little weight.
 5. *Support*: a crack 20 cells wide could be smoothed more than by a line of seven, one cell wide at a bend less. So

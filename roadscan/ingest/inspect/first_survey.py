@@ -239,10 +239,10 @@ def candidates(folder: Path, taken: frozenset[Path] = frozenset()) -> Iterator[P
     ----------
     taken : files that belong to a folder log further up.
     """
-    own = _taken_by_folder_log(folder) - taken
-    if own:
+    of_folder = _taken_by_folder_log(folder) - taken
+    if of_folder:
         yield folder
-    taken |= own
+    taken |= of_folder
     for entry in _entries(folder):
         if entry.name.startswith("."):
             continue
@@ -272,22 +272,22 @@ def _taken_by_folder_log(folder: Path) -> frozenset[Path]:
     same format, in one folder, with names that differ in digits only.
     """
     for log_format in formats_of(folder):
-        own = log_format.files(folder)
+        files = log_format.files(folder)
         if log_format.contents(folder) is not None:
-            return frozenset(own)
-        singly = {path: {f.name for f in formats_of(path)} for path in own[:_SAMPLED]}
+            return frozenset(files)
+        singly = {path: {f.name for f in formats_of(path)} for path in files[:_SAMPLED]}
         others = {path for path, names in singly.items() if names and log_format.name not in names}
         parts = [path for path, names in singly.items() if log_format.name in names]
         is_one = not parts or (len(parts) > 1 and len({_pattern(path) for path in parts}) == 1)
-        if is_one and len(others) < len(singly) and (parts or not _holds_logs(folder, set(own) - others)):
-            return frozenset(own) - others
+        if is_one and len(others) < len(singly) and (parts or not _holds_logs(folder, set(files) - others)):
+            return frozenset(files) - others
     return frozenset()
 
 
-def _holds_logs(folder: Path, own: Set[Path]) -> bool:
+def _holds_logs(folder: Path, files: Set[Path]) -> bool:
     """Return True if a deeper folder also claims to be a log and contains all files of this one: then it is the log."""
     below = [child for child in _entries(folder) if child.is_dir() and not child.is_symlink()]
-    return any(formats_of(child) and all(child in path.parents for path in own) for child in below)
+    return any(formats_of(child) and all(child in path.parents for path in files) for child in below)
 
 
 def _pattern(path: Path) -> tuple[Path, str]:

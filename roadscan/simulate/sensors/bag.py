@@ -252,13 +252,13 @@ class _Messages:
             now = epochs < upto
             pending[:] = [(epochs[~now], points[~now])]
             stamp = int(clock.stamps_ns(np.array([begun]))[0])
-            own = points[now].copy()
-            own["t"] = np.maximum(clock.stamps_ns(epochs[now]) - stamp, 0)  # jitter may put one before its turn
+            sweep = points[now].copy()
+            sweep["t"] = np.maximum(clock.stamps_ns(epochs[now]) - stamp, 0)  # jitter may put one before its turn
             if is_livox:
-                message = serialised(own, stamp, "lidar", number, is_ros1=is_ros1)
-                yield begun + turn_ns, message, int(np.count_nonzero(own["intensity"]))
+                message = serialised(sweep, stamp, "lidar", number, is_ros1=is_ros1)
+                yield begun + turn_ns, message, int(np.count_nonzero(sweep["intensity"]))
                 return
-            yield begun + turn_ns, self._cloud(stamp, own, number), own.size
+            yield begun + turn_ns, self._cloud(stamp, sweep, number), sweep.size
 
         for block in lidar.measure(self.scene, world, self.drive):
             if hits is not None:

@@ -151,9 +151,9 @@ def errors_of(scene: Scene) -> ModelErrors:
     )
     if scene.lidar.errors == "noise":
         return none
-    own = lidar_model(scene.lidar.model).figures.errors
-    lost = own.dropout + noise.dropout - own.dropout * noise.dropout
-    return own.model_copy(update={"range_m": math.hypot(own.range_m, noise.lidar_range_m), "dropout": lost})
+    stated = lidar_model(scene.lidar.model).figures.errors
+    lost = stated.dropout + noise.dropout - stated.dropout * noise.dropout
+    return stated.model_copy(update={"range_m": math.hypot(stated.range_m, noise.lidar_range_m), "dropout": lost})
 
 
 def _strew(rng: np.random.Generator, model: LidarModel, errors: ModelErrors, found: Hits) -> None:

@@ -35,9 +35,9 @@ class Control(LayerKind):
 
     def layers(self, material: Material) -> Iterator[SiteLayer]:
         """Yield one layer; none without surveyed points."""
-        held = material.table("control_residuals")
-        if held is not None and held.rows.num_rows:
-            yield _layer(material, "control_residuals", held.rows, _ARROWS)
+        content = material.table("control_residuals")
+        if content is not None and content.rows.num_rows:
+            yield _layer(material, "control_residuals", content.rows, _ARROWS)
             return
         points = [
             read_groups(material.store, file.path, range(len(file.group_rows)))

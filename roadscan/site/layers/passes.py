@@ -53,10 +53,10 @@ class Passes(LayerKind):
             if one.run not in paths:
                 continue
             epochs, places_m = paths[one.run]
-            own = places_m[(epochs >= one.start_gps_ns) & (epochs <= one.end_gps_ns)]
-            if not len(own):
+            track_m = places_m[(epochs >= one.start_gps_ns) & (epochs <= one.end_gps_ns)]
+            if not len(track_m):
                 continue
-            shapes.append(shapely.simplify(line_of(own), _FAITHFUL_M))
+            shapes.append(shapely.simplify(line_of(track_m), _FAITHFUL_M))
             times = [utc_from_gps_ns(t).isoformat(timespec="seconds") for t in (one.start_gps_ns, one.end_gps_ns)]
             rows.append(
                 {

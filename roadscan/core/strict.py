@@ -128,9 +128,7 @@ def _refuse_open_questions(text: str, path: str | Path) -> None:
 def faults_in_words(model: type[BaseModel], values: Any, error: ValidationError) -> list[str]:
     """Return every fault of a validation in words, one for each key: where, what stands there, what is expected."""
     faults = error.errors(include_url=False)
-    expected_at: dict[
-        tuple[str, str], list[str]
-    ] = {}  # a value that fits no member of a union causes a fault for each member
+    by_place: dict[tuple[str, str], list[str]] = {}  # a value that fits no member of a union has one for each member
     for fault in faults:
         if _is_beside(fault, faults):
             continue
@@ -138,8 +136,8 @@ def faults_in_words(model: type[BaseModel], values: Any, error: ValidationError)
         if fault["type"] in _OF_TAGS:
             place.append(fault["ctx"]["discriminator"].strip("'"))
         where = _place(place, values)
-        expected_at.setdefault((where, _got(fault)), []).append(_expected(fault, holder, where))
-    return [_sentence(where, got, expected) for (where, got), expected in expected_at.items()]
+        by_place.setdefault((where, _got(fault)), []).append(_expected(fault, holder, where))
+    return [_sentence(where, got, expected) for (where, got), expected in by_place.items()]
 
 
 def _is_too_short(fault: Any) -> bool:

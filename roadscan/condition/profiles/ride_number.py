@@ -35,7 +35,7 @@ class RideNumber(NamedTuple):
 
 
 def ride_number_ride(x_m: npt.ArrayLike, height_m: npt.ArrayLike) -> Ride:
-    """Its car's ride on profiles; see :func:`roadscan.condition.profiles.ride.ride` for parameters and errors."""
+    """Return the response of the Ride Number's car to profiles; see :func:`roadscan.condition.profiles.ride.ride` for parameters and errors."""
     return ride(x_m, height_m, RIDE_NUMBER_CAR, squared=True)
 
 

@@ -25,7 +25,7 @@ class Look:
     """One store's names, as listed when the first question came."""
 
     def __init__(self, fs: Any, root: str, before: Look | None = None) -> None:
-        """`before` is an earlier look at the same store: the contents that it kept hold where their names do (ETag)."""
+        """Reuse what an earlier look (`before`) read of the same store, where names of content (ETag) are equal."""
         self._fs, self._root = fs, root
         self._before = {} if before is None else before._named_contents()
         """Contents that were read before the listing, by path and ETag."""

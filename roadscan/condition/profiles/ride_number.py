@@ -35,7 +35,7 @@ class RideNumber(NamedTuple):
 
 
 def ride_number_ride(x_m: npt.ArrayLike, height_m: npt.ArrayLike) -> Ride:
-    """Return the ride of the car of this index; parameters and errors as :func:`roadscan.condition.profiles.ride.ride`."""
+    """Return the ride of this index's car; parameters and errors as :func:`roadscan.condition.profiles.ride.ride`."""
     return ride(x_m, height_m, RIDE_NUMBER_CAR, squared=True)
 
 

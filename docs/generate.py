@@ -34,7 +34,7 @@ from roadscan.core.witness import Witness, witnesses
 from roadscan.ingest.inspect.known_files import known_files
 from roadscan.ingest.reading.format import LogFormat, log_formats
 from roadscan.store.asset_schema import AssetColumn, AssetSchema, asset_kind_names, asset_schema
-from roadscan.store.readings.packed_view import beams_query, returns_query
+from roadscan.store.readings.packed_returns import beams_query, returns_query
 from roadscan.store.schema import TableSchema, schema_folder, schema_names, table_schema
 from roadscan.tiles.product import Product, SurfaceProduct, TileFiles, products
 

@@ -1,4 +1,4 @@
-"""Surveys from NumPy arrays and DataFrames: logs that `roadscan run` reads, written in roadscan's own formats.
+"""Surveys from NumPy arrays and DataFrames: logs that `roadscan run` reads, written in roadscan's formats.
 
 - :func:`write_trajectory`: poses by column name, as `trajectory_table`;
 - :func:`write_profiles`: heights over positions across, as `scans`;

@@ -3,7 +3,7 @@
 Corrections are piecewise linear between knots in time. Each component of each run has a first-order Gauss–Markov
 process as prior, whose σ is that of each pose (:mod:`roadscan.adjust.process`); ties and control are observations; what
 solves them is one sparse least-squares problem (:mod:`roadscan.adjust.sparse_normal`), weighed anew until nothing
-changes (:mod:`roadscan.adjust.weights`). A control point's survey is an observation of its own: all runs that saw the
+changes (:mod:`roadscan.adjust.weights`). A control point's survey is a separate observation: all runs that saw the
 point share its error. Surveys are first left aside, and judged by what poses and ties say of them
 (:mod:`roadscan.adjust.control.control_test`); then those that are right count, wholly. Mountings of sensors, which all
 runs share, are unknowns beside the poses.
@@ -39,10 +39,10 @@ _NEIGHBOURS: Final = 50
 """With more points, at most this many neighbours are judged together."""
 _LENS: Final = len(PARAMETERS)
 _JOINT_NS: Final = 500_000_000
-"""Knots at which the errors of pictures are told jointly are so far apart (ns), about: in between, σ of places measured
-in two pictures are within 15 % of those that each picture's own covariances give."""
+"""Knots at which errors of pictures are given jointly are so far apart (ns), about: in between, σ of places measured
+in two pictures are within 15 % of those that each picture's covariances give."""
 _LATER: Final = 12
-"""With so many of the next such knots the errors of a pose are told: 6 s, in which a picture's reach is passed."""
+"""With so many of the next such knots the errors of a pose are given: 6 s, in which a picture's reach is passed."""
 _SCALED: Final = 3
 """The stated σ of single runs are enlarged at most this many times, until none is too small."""
 SURVEY_FACTOR: Final = "control_survey"
@@ -162,7 +162,7 @@ class Adjustment:
     weight: Float64
     """(n,) 1 = counts fully, 0 = rejected or not used."""
     redundancy: Float64
-    """(n,) share of its own error that its residual shows, 0 to 1; NaN where not used."""
+    """(n,) share of its error that its residual shows, 0 to 1; NaN where not used."""
     normalised_residual: Float64
     """(n,) against the prediction of all others, over its σ; NaN where not used."""
     control: ControlErrors
@@ -189,7 +189,7 @@ class Adjustment:
     run_factors: Float64
     """(runs, 6) factors by which the stated variances of single runs' poses were multiplied."""
     fixed: tuple[FixedRun, ...] = ()
-    """Estimated errors of the runs that are held fixed."""
+    """Estimated errors of the runs that are fixed."""
 
     @property
     def sigma(self) -> tuple[Float64, ...]:

@@ -46,7 +46,7 @@ _SOME: Final = 1.0
 _SURE: Final = 0.99
 """Share of right solutions whose corrections are no larger."""
 _RIGID: Final = 1e14
-"""Weight, in units of the prior's, of an unknown that is held at 0: others move it by less than a double shows in a
+"""Weight, in units of the prior's, of an unknown that is fixed at 0: others move it by less than a double shows in a
 millimetre."""
 _MEDIAN: Final = 0.6745
 """Median of the absolute value of a standard normal number."""
@@ -196,7 +196,7 @@ class Rounds:
         return self._equations.covariances(groups)
 
     def holding(self, fixed: Bool) -> Float64:
-        """Last solution (u,) with some unknowns (u,) held at 0, and the weights of the rounds without that."""
+        """Last solution (u,) with some unknowns (u,) fixed at 0, and the weights of the rounds without that."""
         value = self._value / np.append(self._processes, 1.0)[self._component]
         own = fixed[self._row] & (self._row == self._column)
         rows, scaled = self.problem.rows, self._counted() / self._own()

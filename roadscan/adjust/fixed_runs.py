@@ -1,4 +1,4 @@
-"""Runs that are held fixed: their recorded poses are final, and other evidence estimates the errors of these."""
+"""Runs that are fixed: their recorded poses are final, and other evidence estimates the errors of these."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from roadscan.core.gpstime import NS_PER_S
 
 @dataclass(frozen=True)
 class FixedRun:
-    """A run that is held fixed, and the corrections that it would have if it were not."""
+    """A run that is fixed, and the corrections that it would have if it were not."""
 
     run: str
     error: Float64

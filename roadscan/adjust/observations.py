@@ -26,7 +26,7 @@ import numpy.typing as npt
 
 from roadscan.compute.array_types import Float64, Int32, Int64, UInt8
 from roadscan.pictures.camera_changes import COLUMNS
-from roadscan.poses.mounting_change import Seat
+from roadscan.poses.movement import Seat
 
 KINDS: Final = (
     "height_tie", "shift_tie", "plane_tie", "control_height", "control_position", "head_tie", "hand_tie",

@@ -40,7 +40,7 @@ class VerticalAccuracy:
     nssda_95: float
     """Accuracy_z of NSSDA: 1.9600 RMSE_z."""
     asprs_rmse: float
-    """RMSE_V of ASPRS (2023): with the σ of the check points' own survey."""
+    """RMSE_V of ASPRS (2023): with the σ of the check points' survey."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class HorizontalAccuracy:
     nssda_95: float
     """Accuracy_r of NSSDA: 1.7308 RMSE_r."""
     asprs_rmse: float
-    """RMSE_H of ASPRS (2023): with the σ of the check points' own survey."""
+    """RMSE_H of ASPRS (2023): with the σ of the check points' survey."""
 
 
 def vertical_accuracy(
@@ -70,7 +70,7 @@ def vertical_accuracy(
     Parameters
     ----------
     error_m : (n,) surface minus survey; NaN where there is none.
-    survey_sigma_m : 1 σ of the check points' own heights, one value or (n,).
+    survey_sigma_m : 1 σ of the check points' heights, one value or (n,).
     point : (n,) number of the point of each error, where passes saw a point several times: it counts once, with the
         mean of its errors, of their sizes and of their squares.
 
@@ -104,7 +104,7 @@ def horizontal_accuracy(
     Parameters
     ----------
     error_m : (n, 2) north and east, surface minus survey; NaN where there is none.
-    survey_sigma_m : 1 σ of each coordinate of the check points' own survey, one value, (n, 1) or (n, 2).
+    survey_sigma_m : 1 σ of each coordinate of the check points' survey, one value, (n, 1) or (n, 2).
     point : as of :func:`vertical_accuracy`.
 
     Raises

@@ -152,7 +152,7 @@ class HandTies(Strict):
     second_easting_m, second_northing_m (map, m). What may be left out: name; kind (`place`, `height` or `both`);
     first_time, second_time (ISO 8601 with time zone: which time the run came by); sigma_m, sigma_height_m."""
     kind: Literal["place", "height", "both"] = "both"
-    """What ties without a kind of their own say."""
+    """What ties without a stated kind say."""
     sigma_m: float = Field(default=0.02, gt=0.0, le=10.0)
     """1 σ of the difference of two places, on each axis, where a tie states none (m)."""
     sigma_height_m: float = Field(default=0.01, gt=0.0, le=10.0)
@@ -175,7 +175,7 @@ class AdjustConfig(SurveySection):
     as joint, and heights alone are corrected; `helmert`: the survey as a whole is shifted and turned onto its control
     points with targets, nothing else."""
     fixed: list[str] = []
-    """Runs that are held fixed, an earlier survey or a reference: their recorded poses hold to the bit, and those of
+    """Runs that are fixed, an earlier survey or a reference: their recorded poses hold to the bit, and those of
     other runs are adjusted to them. How well their poses are known is taken from their σ. Mountings of their sensors
     are not estimated."""
     priors: PosePriors = PosePriors()
@@ -216,7 +216,7 @@ class AdjustConfig(SurveySection):
         return self
 
     def check_survey(self, config: SurveyConfig) -> None:
-        """Raise :class:`ValueError` where runs are held fixed that the survey has not, or all of them."""
+        """Raise :class:`ValueError` where runs are fixed that the survey has not, or all of them."""
         fixed, runs = self.fixed if self.on else [], [run.id for run in config.runs]
         for run in fixed:
             if run not in runs:

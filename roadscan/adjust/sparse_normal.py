@@ -1,7 +1,7 @@
 """Sparse normal equations: their factor, their solution, and the needed part of their inverse.
 
 The factor L D Lᵀ with an approximate minimum degree ordering is QDLDL's (Stellato et al. 2020; Davis 2005); the
-selected inverse is in `adjust/kernels/selected_inverse.py`.
+selected inverse is in `adjust/kernels/normal_equations.py`.
 """
 
 from __future__ import annotations
@@ -14,8 +14,14 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
-from roadscan.adjust.kernels.normal_equations import add_observations
-from roadscan.adjust.kernels.selected_inverse import entries, path_lengths, selected_inverse, solved_units, variances
+from roadscan.adjust.kernels.normal_equations import (
+    add_observations,
+    entries,
+    path_lengths,
+    selected_inverse,
+    solved_units,
+    variances,
+)
 from roadscan.compute.array_types import Float64, Int64
 
 

@@ -19,7 +19,7 @@ class PlaceSettings(Strict):
     lidar_radius_m: float = Field(default=8.0, gt=0.0, le=100.0)
     """Half the edge of the square that their planes are taken from (m)."""
     seams_per_km: float = Field(default=50.0, gt=0.0, le=2000.0)
-    """Places per kilometre where heads of one pass that overlap by a few centimetres are held against one another."""
+    """Places per kilometre where heads of one pass that overlap by a few centimetres are compared."""
     seam_radius_m: float = Field(default=2.0, gt=0.0, le=20.0)
     """Half the length of road that is compared at each of them (m): a narrow strip has to be long."""
     margin_m: float = Field(default=0.3, ge=0.0)

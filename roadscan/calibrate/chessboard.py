@@ -70,7 +70,7 @@ class InteriorOptions(Strict):
     """Largest accepted 1 σ of the focal length, as a share of it: larger where the board is never tilted."""
     least_tilt_deg: float = Field(default=15.0, ge=0.0, lt=80.0)
     """At least a third of the boards are tilted by this much against the picture's plane (degrees): from flat views
-    alone distance and focal length cannot be told apart."""
+    alone distance and focal length cannot be distinguished."""
     outlier: float = Field(default=3.0, gt=1.0)
     """Pictures with an RMS of more than this many times the usual one are left out."""
     radial: Literal[1, 2, 3] | None = None
@@ -205,10 +205,10 @@ def _views(
     for name, grey in pictures:
         reason, corners = "it cannot be read as a picture", None
         if grey is not None:
-            own = (grey.shape[1], grey.shape[0])
-            size = size or own
-            if own != size:
-                reason = f"it has {own[0]} × {own[1]} pixels, the first {size[0]} × {size[1]}"
+            pixels_of_file = (grey.shape[1], grey.shape[0])
+            size = size or pixels_of_file
+            if pixels_of_file != size:
+                reason = f"it has {pixels_of_file[0]} × {pixels_of_file[1]} pixels, the first {size[0]} × {size[1]}"
             else:
                 corners = find_corners(grey, board)
                 reason = f"no whole board of {board.columns} × {board.rows} inner corners was found in it"

@@ -68,22 +68,22 @@ def _sensors(calibration: Calibration) -> Iterator[str]:
         for axis in range(6):
             unit, scale, digits = ("mm", 1e3, 2) if axis < 3 else ("°", 180.0 / np.pi, 4)
             of_change, sigma, prior = (scale * float(v[axis]) for v in (change, one.sigma, one.prior_sigma))
-            held = "   not determined" if prior > 0 and sigma > 0.9 * prior else ""
+            remark = "   not determined" if prior > 0 and sigma > 0.9 * prior else ""
             yield (
                 f"  {AXES[axis]:18s} {of_change:+10.{digits}f} {unit:2s}  σ {sigma:8.{digits}f}"
-                f"  before: {prior:.{digits}f}{held}"
+                f"  before: {prior:.{digits}f}{remark}"
             )
         if one.range_offset_sigma_m > 0:
             yield f"  {AXES[6]:18s} {1e3 * one.range_offset_m:+10.2f} mm  σ {1e3 * one.range_offset_sigma_m:8.2f}"
 
 
 def _undetermined(calibration: Calibration) -> Iterator[str]:
-    held = calibration.observability.undetermined
-    if not held:
+    undetermined = calibration.observability.undetermined
+    if not undetermined:
         yield "The evidence determines all mountings."
         return
     yield "The evidence does not determine these; they keep the values of the rig file:"
-    yield from (f"  {words}" for words in held)
+    yield from (f"  {words}" for words in undetermined)
 
 
 def _kinds(calibration: Calibration) -> Iterator[str]:

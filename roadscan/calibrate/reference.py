@@ -85,9 +85,9 @@ class ReferenceOptions(Strict):
     incidence_max_deg: float = Field(default=78.0, gt=10.0, lt=90.0)
     """Readings that meet a surface at a flatter angle are left out (degrees from its normal)."""
     range_min_m: float = Field(default=1.0, ge=0.0)
-    """Readings nearer than this are left out: the own vehicle (m)."""
+    """Readings nearer than this are left out: the survey vehicle (m)."""
     readings_a_patch: int = Field(default=40, ge=1)
-    """No more readings than these are tied to one plane: its own error would soon dominate."""
+    """No more readings than these are tied to one plane: its error would soon dominate."""
     most_ties: int = Field(default=10_000, ge=100)
     """No more ties than these are handed to the estimator."""
 

@@ -265,9 +265,9 @@ class _Block:
         """Return the poses corrected by the errors that the estimator found."""
         position, attitude = self.stated.position_m.copy(), self.stated.world_from_body.copy()
         for k, correction in calibration.corrections.items():
-            own = self.picture == k
-            position[own] += self.exposures[k].error.world_from_ned @ correction.shift_north_east_down_m
-            attitude[own] = attitude[own] @ exponential(correction.turn_roll_pitch_heading_rad)
+            rows = self.picture == k
+            position[rows] += self.exposures[k].error.world_from_ned @ correction.shift_north_east_down_m
+            attitude[rows] = attitude[rows] @ exponential(correction.turn_roll_pitch_heading_rad)
         return _Poses(position, attitude)
 
     @cached_property
@@ -318,8 +318,8 @@ class _Block:
         """Return the mounting that most measurements support: computed from one picture, or the rig file's."""
         starts = [("the rig file", nominal)]
         for k, exposure in enumerate(self.exposures):
-            own = np.flatnonzero(self.picture == k)
-            mounting = self._alone(own) if own.size >= _LEAST_OF_A_PICTURE else None
+            rows = np.flatnonzero(self.picture == k)
+            mounting = self._alone(rows) if rows.size >= _LEAST_OF_A_PICTURE else None
             if mounting is not None:
                 starts.append((f"picture {exposure.name} by itself", mounting))
         return max(starts, key=lambda start: int(self.plausible(start[1]).sum()))
@@ -337,13 +337,13 @@ class _Block:
         away = np.linalg.norm(project(self.interior, self.in_sensor(mounting, self.stated)) - self.pixel, axis=1)
         return np.asarray(away < gate)
 
-    def _alone(self, own: Int64) -> Mounting | None:
+    def _alone(self, picked: Int64) -> Mounting | None:
         """Compute the mounting from the measurements of one picture, robust against wrong ones."""
-        origin = self.stated.position_m[own[0]]
+        origin = self.stated.position_m[picked[0]]
         cv2.setRNGSeed(0)
         found, turn, shift, _ = cv2.solvePnPRansac(
-            np.ascontiguousarray(self.point_m[own] - origin),
-            np.ascontiguousarray(self.pixel[own]),
+            np.ascontiguousarray(self.point_m[picked] - origin),
+            np.ascontiguousarray(self.pixel[picked]),
             *_opencv(self.interior),
             iterationsCount=_RANSAC_ROUNDS,
             reprojectionError=_START_GATE_PX,
@@ -354,7 +354,7 @@ class _Block:
         opencv_from_world, _ = cv2.Rodrigues(turn)
         world_from_sensor = opencv_from_world.T @ SENSOR_FROM_OPENCV.T
         camera_m = -opencv_from_world.T @ np.asarray(shift, np.float64).ravel()
-        attitude = self.stated.world_from_body[own[0]]
+        attitude = self.stated.world_from_body[picked[0]]
         rotation, lever = attitude.T @ world_from_sensor, attitude.T @ camera_m
         if not (np.isfinite(rotation).all() and np.isfinite(lever).all()):
             return None
@@ -389,11 +389,11 @@ class _Block:
     def _rows(self, mounting: Mounting, poses: _Poses, chosen: Int64) -> tuple[Float64, Float64, Float64]:
         """Return depths (k,), derivatives (k, 2, 3) of the tangents by the points, and their covariance (k, 2, 2)."""
         depth = np.maximum(self.in_sensor(mounting, poses)[chosen, 0], _BEHIND_M)
-        own = np.zeros((chosen.size, 2, 3))
-        own[:, 0, 1] = own[:, 1, 2] = 1.0
-        own[:, :, 0] = -self.tangent[chosen]
+        projection = np.zeros((chosen.size, 2, 3))
+        projection[:, 0, 1] = projection[:, 1, 2] = 1.0
+        projection[:, :, 0] = -self.tangent[chosen]
         world_from_sensor = poses.world_from_body[chosen] @ mounting.arrays()[0]
-        rows = own @ world_from_sensor.transpose(0, 2, 1) / depth[:, None, None]
+        rows = projection @ world_from_sensor.transpose(0, 2, 1) / depth[:, None, None]
         # k pictures of a point share its error: k times the variance for each gives their mean the point's variance.
         sharing = np.bincount(self.target[chosen], minlength=len(self.targets))[self.target[chosen]]
         point = np.array([t.covariance_m2 for t in self.targets])[self.target[chosen]] * sharing[:, None, None]
@@ -419,9 +419,9 @@ class _Block:
         """Return the worst outlier (n,) of each picture: it may have made others outliers."""
         worst = np.zeros(use.size, dtype=bool)
         for k in np.unique(self.picture):
-            own = np.flatnonzero(use & (self.picture == k) & (normalised > _OUTLIER))
-            if own.size:
-                worst[own[np.argmax(normalised[own])]] = True
+            outliers = np.flatnonzero(use & (self.picture == k) & (normalised > _OUTLIER))
+            if outliers.size:
+                worst[outliers[np.argmax(normalised[outliers])]] = True
         return worst
 
     def residuals(self, calibration: Calibration, use: Bool) -> tuple[Residual, ...]:

@@ -1,4 +1,4 @@
-"""Arrow without pandas, which it imports before its first array for a tenth of a second, for commands that make no frame.
+"""Arrow without pandas, which it imports before its first array (0.1 s), for commands that make no frame.
 
 Arrow asks once whether pandas is installed. Who makes a frame of a table imports it all the same
 (:meth:`pyarrow.Table.to_pandas` asks again); only arrays of pandas' own columns would be taken for any others.

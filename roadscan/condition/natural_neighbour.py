@@ -8,12 +8,13 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.array_types import Float64
-from roadscan.condition.kernels.delaunay_mesh import mesh_of, triangulate
 from roadscan.condition.kernels.natural_neighbour import (
     STEP_M,
     circle_centres,
+    mesh_of,
     natural_neighbour_raster,
     slopes_of_points,
+    triangulate,
 )
 
 WIDEST_M: Final = 100.0

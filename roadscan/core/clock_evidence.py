@@ -26,7 +26,7 @@ class MotionEvidence(Strict):
     sensor: str
     """Sensor whose clock is estimated: an IMU or an encoder of the rig."""
     runs: list[str] = []
-    """Runs, each with a clock of its own; all where left out."""
+    """Runs, each with a separate clock; all where left out."""
     against: str = "trajectory"
     """What feels the same motion on GPS time: "trajectory", or an IMU of the rig."""
     also: list[str] = []
@@ -34,7 +34,7 @@ class MotionEvidence(Strict):
     search_s: float = Field(default=5.0, gt=0.0, le=3600.0)
     """Largest offset looked for, to both sides (s)."""
     drift: Drift = "auto"
-    """Whether the rate of the clock is estimated; "auto": as far as the data determine it, held within the 100 ppm
+    """Whether the rate of the clock is estimated; "auto": as far as the data determine it, kept within the 100 ppm
     (1 σ) of a usual quartz where they do not."""
     delay_s: float = Field(default=0.0, ge=-1.0, le=1.0)
     """How late the sensor stamps what it feels, beside its clock (s): half the interval where a sample is the mean
@@ -81,7 +81,7 @@ class PairEvidence(Strict):
     """For arrivals: the least time from stamp to arrival (s). What is not stated stays in the offset: epochs are late
     by as much."""
     drift: Drift = "auto"
-    """Whether the rate is estimated; "auto": as far as the pairs determine it, held within the 100 ppm (1 σ) of a
+    """Whether the rate is estimated; "auto": as far as the pairs determine it, kept within the 100 ppm (1 σ) of a
     usual quartz where they do not."""
 
     @model_validator(mode="after")

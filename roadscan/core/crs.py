@@ -3,7 +3,7 @@
 A *world frame* is Cartesian and holds poses: the geocentric frame of a datum (ECEF), or
 ``"local"`` for a rig whose poses are not tied to the Earth. A *map frame* is what products are
 written in: easting, northing and height, always in metres inside roadscan; products convert to
-the CRS's own unit. PROJ's network access is off, and a geoid is applied only from a named grid.
+the CRS's unit. PROJ's network access is off, and a geoid is applied only from a named grid.
 """
 
 from __future__ import annotations
@@ -324,7 +324,7 @@ class MapFrame:
     """The survey's map: a projected CRS, or a local engineering frame.
 
     Coordinates are (n, 3) easting, northing, height in **metres**; divide by
-    `horizontal_unit_m` and `vertical_unit_m` for the CRS's own units.
+    `horizontal_unit_m` and `vertical_unit_m` for the CRS's units.
     """
 
     crs: str | None

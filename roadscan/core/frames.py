@@ -105,7 +105,7 @@ def quaternion_from_rotation(rotation: Float64) -> Float64:
     squares = 1.0 + 2.0 * diagonal
     squares[..., 0] = 1.0 + trace
     squares[..., 1:] -= trace[..., None]
-    # Row k of `candidates` is the quaternion scaled by its own component k.
+    # Row k of `candidates` is the quaternion scaled by its component k.
     yz, zy = r[..., 2, 1], r[..., 1, 2]
     xz, zx = r[..., 0, 2], r[..., 2, 0]
     xy, yx = r[..., 1, 0], r[..., 0, 1]

@@ -55,11 +55,11 @@ class TimeSystem(StrEnum):
     UNIX_UTC = "unix_utc"
     """POSIX time: seconds from 1970-01-01 UTC, leap seconds not counted."""
     UNIX_TAI = "unix_tai"
-    """Seconds from 1970-01-01 on TAI (PTP's own scale)."""
+    """Seconds from 1970-01-01 on TAI (PTP's scale)."""
     UTC_HOUR = "utc_hour"
     """Time past the full UTC hour (Velodyne); the hour comes from `date` and the log itself."""
     FREE = "free"
-    """The sensor's own counter; `offset_s` (measured) brings it to GPS seconds since 1980."""
+    """The sensor's counter; `offset_s` (measured) brings it to GPS seconds since 1980."""
 
 
 UNIT_NS: Final[dict[str, int]] = {"s": NS_PER_S, "ms": 1_000_000, "us": 1_000, "ns": 1}  # ns in each unit of stamps
@@ -148,7 +148,7 @@ class Clock:
 
     gps = scale(stamp) + offset_s + drift_ppm · 1e-6 · (stamp − reference_s)
 
-    where ``scale`` is the time system's own rule and every quantity is in seconds.
+    where ``scale`` is the time system's rule and every quantity is in seconds.
     """
 
     system: TimeSystem
@@ -163,7 +163,7 @@ class Clock:
     drift_ppm: float = 0.0
     """Measured rate error of the clock (parts per million), from `reference_s` on."""
     reference_s: float = 0.0
-    """Stamp (in seconds of the log's own count) at which `offset_s` was measured."""
+    """Stamp (in seconds of the log's count) at which `offset_s` was measured."""
 
     def first_week(self) -> int:
         """GPS week of the first stamp, from `week` or `date`."""

@@ -97,7 +97,7 @@ class Sensor(Strict):
     axes: str = "frd"
     """Where the sensor's x, y, z point when it is mounted without misalignment: three letters of f(orward) b(ack)
     r(ight) l(eft) u(p) d(own), right-handed: one of 24 codes such as frd, flu or urf. Ignored with
-    `body_from_sensor`. Where it is left out, the log's own statement holds, if its format makes one."""
+    `body_from_sensor`. Where it is left out, the log's statement holds, if its format makes one."""
     lever_arm_body_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """From the IMU reference point to the sensor's origin, body axes forward, right, down (m)."""
     boresight: Boresight = Boresight()
@@ -108,7 +108,7 @@ class Sensor(Strict):
     """Confirms a lever arm or axes for readings that are in the vehicle's frame already, which are refused otherwise:
     the maker's vehicle frame is then mounted in the body, because it is not the one that the trajectory holds."""
     range_min_m: float = Field(default=0.0, ge=0.0)
-    """Returns and readings of profiles nearer than this are left out (own vehicle); points of clouds have no range."""
+    """Returns and readings of profiles nearer than this are left out (the vehicle); points of clouds have no range."""
     range_max_m: float = Field(default=float("inf"), gt=0.0, allow_inf_nan=True)
     """Returns and readings of profiles farther than this are left out."""
     divergence_deg: float | None = Field(default=None, ge=0.0, le=2.0)
@@ -133,7 +133,7 @@ class Sensor(Strict):
     is surveyed below the camera, footprints of its pictures lie on a level plane so far below it; left out, they have
     none."""
     own_vehicle_px: tuple[tuple[tuple[float, float], ...], ...] = ()
-    """Polygons in a camera's pictures that show its own vehicle, each a list of corners (u, v), in pixels from the
+    """Polygons in a camera's pictures that show the vehicle, each a list of corners (u, v), in pixels from the
     centre of the upper left one: neither a colour nor a tie point is taken from there."""
 
     @model_validator(mode="after")

@@ -125,27 +125,27 @@ def replace_file(file: Path, content: bytes) -> None:
 
 def _with_value(text: str, sensor: str, key: str, value: Any, file: str | Path | None) -> str:
     """Return the text with one value replaced in place, or added to the sensor's table."""
-    own = ("sensors", sensor)
+    sensor_table = ("sensors", sensor)
     statements = list(_statements(text, sensor, file))
-    header = [s for s in statements if s.table == own and not s.key]
+    header = [s for s in statements if s.table == sensor_table and not s.key]
     if len(header) != 1:
         raise _unsafe(sensor, "it does not stand in a table of its own", file)
-    if any(s.table == own and len(s.key) > 1 and s.key[0] == key for s in statements):
+    if any(s.table == sensor_table and len(s.key) > 1 and s.key[0] == key for s in statements):
         raise _unsafe(sensor, f"'{key}' is stated by dotted keys", file)
-    stated = [s for s in statements if s.table == own and s.key == (key,)]
+    stated = [s for s in statements if s.table == sensor_table and s.key == (key,)]
     if stated:
         begin, end = stated[0].value
         return text[:begin] + toml(value) + text[end:]
-    table = [s for s in statements if s.table == (*own, key)]
+    table = [s for s in statements if s.table == (*sensor_table, key)]
     if table:
         return _with_table(text, table, value, sensor, file)
     newline = "\r\n" if "\r\n" in text else "\n"
     if isinstance(value, dict):
-        last = [s for s in statements if s.table[: len(own)] == own][-1]
-        name = ".".join(toml_key(k) for k in (*own, key))
+        last = [s for s in statements if s.table[: len(sensor_table)] == sensor_table][-1]
+        name = ".".join(toml_key(k) for k in (*sensor_table, key))
         lines = [f"[{name}]", *(f"{toml_key(k)} = {toml(v)}" for k, v in value.items())]
         return _inserted(text, last.end, ["", *lines], newline)
-    last = [s for s in statements if s.table == own][-1]
+    last = [s for s in statements if s.table == sensor_table][-1]
     return _inserted(text, last.end, [f"{toml_key(key)} = {toml(value)}"], newline)
 
 

@@ -1,6 +1,6 @@
 """Remembers a request to end the program (Ctrl-C, or a system signal) until the program ends.
 
-It is raised as :class:`Stopped`, but a library that was just calling back may raise its own error instead
+It is raised as :class:`Stopped`, but a library that was just calling back may raise another error instead
 (lazrs does). So code that catches every error calls :func:`stop_if_asked` before it continues.
 """
 

@@ -128,7 +128,7 @@ def _refuse_open_questions(text: str, path: str | Path) -> None:
 def faults_in_words(model: type[BaseModel], values: Any, error: ValidationError) -> list[str]:
     """Return every fault of a validation in words, one for each key: where, what stands there, what is expected."""
     faults = error.errors(include_url=False)
-    told: dict[tuple[str, str], list[str]] = {}  # a value that fits no member of a union causes a fault for each member
+    by_place: dict[tuple[str, str], list[str]] = {}  # a value that fits no member of a union has one for each member
     for fault in faults:
         if _is_beside(fault, faults):
             continue
@@ -136,8 +136,8 @@ def faults_in_words(model: type[BaseModel], values: Any, error: ValidationError)
         if fault["type"] in _OF_TAGS:
             place.append(fault["ctx"]["discriminator"].strip("'"))
         where = _place(place, values)
-        told.setdefault((where, _got(fault)), []).append(_expected(fault, holder, where))
-    return [_sentence(where, got, expected) for (where, got), expected in told.items()]
+        by_place.setdefault((where, _got(fault)), []).append(_expected(fault, holder, where))
+    return [_sentence(where, got, expected) for (where, got), expected in by_place.items()]
 
 
 def _is_too_short(fault: Any) -> bool:
@@ -146,7 +146,7 @@ def _is_too_short(fault: Any) -> bool:
 
 
 def _is_beside(fault: Any, faults: Sequence[Any]) -> bool:
-    """Return whether a fault is implied by another one: a table's own faults, or the last missing item, say more."""
+    """Return whether a fault is implied by another one: a table's faults, or the last missing item, say more."""
     above = fault["loc"][:-1]
     if _is_too_short(fault):
         return any(_is_too_short(f) and f["loc"][:-1] == above and f["loc"][-1] > fault["loc"][-1] for f in faults)
@@ -172,9 +172,9 @@ def _toml_value(value: Any) -> str:
 
 
 def _sentence(where: str, got: str, expected: list[str]) -> str:
-    own = list(dict.fromkeys(expected))
-    choices = [one.removeprefix(_EXPECTED) for one in own if one.startswith(_EXPECTED)]
-    rest = [one for one in own if not one.startswith(_EXPECTED)]
+    distinct = list(dict.fromkeys(expected))
+    choices = [one.removeprefix(_EXPECTED) for one in distinct if one.startswith(_EXPECTED)]
+    rest = [one for one in distinct if not one.startswith(_EXPECTED)]
     said = "; ".join([*rest, *([_EXPECTED + " or ".join(choices)] if choices else [])])
     if any(one.startswith(("unknown key ", "key ")) for one in rest) or not where:
         return said

@@ -54,7 +54,7 @@ class MapConfig(Strict):
     """Map frame of the survey and its heights."""
 
     crs: str | None = None
-    """Projected CRS, such as "EPSG:25832"; its own unit is used in the products. One that counts south, then west
+    """Projected CRS, such as "EPSG:25832"; its unit is used in the products. One that counts south, then west
     (EPSG:5513, EPSG:2065), is refused: left and right would be exchanged."""
     local: LocalConfig | None = None
     """A local engineering frame, in place of `crs`, or the frame of local poses beside it."""
@@ -120,7 +120,7 @@ class ClockConfig(Strict):
     drift_ppm: float = 0.0
     """Measured rate error (parts per million) from `reference_s` on."""
     reference_s: float = 0.0
-    """Stamp at which `offset_s` was measured (s of the log's own count)."""
+    """Stamp at which `offset_s` was measured (s of the log's count)."""
     pairs: PairEvidence | None = None
     """Pairs of (stamp, GPS time) that offset and drift are computed from, in place of stating them."""
 
@@ -148,7 +148,7 @@ class ClockDefaults(Strict):
     """Time system of logs that state none, and the week or date of those that state neither."""
 
     system: TimeSystem | None = None
-    """Time system of a log that states no clock and whose format asks for one; a log that knows its own time keeps
+    """Time system of a log that states no clock and whose format asks for one; a log that knows its time keeps
     it. Not `free`: such a clock is one sensor's own. Left out, only `week` or `date` is a default."""
     unit: Literal["s", "ms", "us", "ns"] = "s"
     """Unit of the stamps of such a log."""
@@ -576,12 +576,12 @@ class Survey:
         found: list[LanePass] = []
         for run in self.config.runs:
             run_id = RunId(run.id)
-            own = None if run.id in stated else PassId(next(free))
+            number = None if run.id in stated else PassId(next(free))
             if run_id not in run_spans_gps_ns:
                 continue
             first, last = run_spans_gps_ns[run_id]
-            if own is not None:
-                found.append(LanePass(own, run_id, first, last + 1))
+            if number is not None:
+                found.append(LanePass(number, run_id, first, last + 1))
                 continue
             for one in self.config.passes:
                 if one.run == run.id:

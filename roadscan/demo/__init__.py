@@ -1,1 +1,1 @@
-"""The demo: a small survey is simulated, run, and held against its truth."""
+"""The demo: a small survey is simulated, run, and compared with its truth."""

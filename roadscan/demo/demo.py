@@ -145,12 +145,12 @@ def summarise(survey_file: Path, min_count: int = 3) -> DemoSummary:
 
 def _lanes(session: Session, true: truth.Truth) -> Iterator[DemoLane]:
     """Condition of each lane beside its truth."""
-    held: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    by_lane: dict[str, dict[str, list[tuple[float, float]]]] = {}
     for one in compared_values(session, lambda e, n: true.surface.height_m(e, n, texture=False)):
         pair = one.found.value, one.true.value
         if one.found.quantity in _SHOWN and np.isfinite(pair).all():
-            held.setdefault(one.lane, {}).setdefault(one.found.quantity, []).append(pair)
-    for lane, values in sorted(held.items()):
+            by_lane.setdefault(one.lane, {}).setdefault(one.found.quantity, []).append(pair)
+    for lane, values in sorted(by_lane.items()):
         means = {name: np.mean(pairs, axis=0).tolist() for name, pairs in values.items()}
         if means.keys() == set(_SHOWN):
             yield DemoLane(lane, {n: m[0] for n, m in means.items()}, {n: m[1] for n, m in means.items()})

@@ -8,7 +8,7 @@
 3. *Rim*: what lies between the outline and the rim is less deep than `edge_depth_m`. Its area follows from how fast the
    area of the hole shrinks with depth, A(d) ~ (D − d)^k with the greatest depth D: of a hole with a paraboloid's form k
    is 1, of a cone 2, of one with upright walls 0; the mean depth over the outline's area determines it.
-4. Each tile has the pieces of its own cells; :func:`join_potholes` unites those that touch and judges the whole: area,
+4. Each tile has the pieces of its cells; :func:`join_potholes` unites those that touch and judges the whole: area,
    depth, elongation (length over the diameter of the largest circle in it).
 """
 

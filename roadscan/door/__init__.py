@@ -493,7 +493,7 @@ class LogTables(Mapping[str, "pa.Table"]):
 def read_log(
     path: str | Path,
     *,
-    format: str | None = None,  # noqa: A002  the survey file's own word
+    format: str | None = None,  # noqa: A002  the survey file's word
     clock: Clock | Mapping[str, Any] | str | None = None,
     crs: str | None = None,
     height: Literal["ellipsoidal", "orthometric"] | None = None,

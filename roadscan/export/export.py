@@ -37,7 +37,7 @@ def source_in(plan: SurveyPlan, run: str, sensor: str) -> tuple[ReadingSource, l
         raise ConfigError(
             f"the logs of '{sensor}' in run '{run}' are placed in different ways", expected="one geometry"
         )
-    files = sorted((f for _, own in found for f in own), key=lambda f: (f.span or (0, 0), f.path))
+    files = sorted((f for _, files_of_log in found for f in files_of_log), key=lambda f: (f.span or (0, 0), f.path))
     return found[0][0], files
 
 

@@ -109,12 +109,12 @@ def _columns(settings: CrgSettings) -> int:
 
 
 def _pass(plan: SurveyPlan, run: str, pass_id: int | None) -> LanePass:
-    own = [p for p in plan.passes if p.run == run]
-    chosen = [p for p in own if pass_id in {None, int(p.pass_id)}]
+    of_run = [p for p in plan.passes if p.run == run]
+    chosen = [p for p in of_run if pass_id in {None, int(p.pass_id)}]
     if len(chosen) != 1:
         raise ConfigError(
-            f"run '{run}' has {len(own)} passes" if pass_id is None else f"run '{run}' has no pass {pass_id}",
-            expected="--pass, one of " + ", ".join(str(p.pass_id) for p in own),
+            f"run '{run}' has {len(of_run)} passes" if pass_id is None else f"run '{run}' has no pass {pass_id}",
+            expected="--pass, one of " + ", ".join(str(p.pass_id) for p in of_run),
         )
     return chosen[0]
 
@@ -150,10 +150,10 @@ def _placed(
     tile_quanta = plan.ground.grid.size_quanta
     for one in slices:
         for _, points in placer.place(one, EVERYWHERE):
-            own = (points.epoch_gps_ns >= first) & (points.epoch_gps_ns < end)
-            whole = points.tiles[own].astype(np.int64) * tile_quanta + points.quanta[own, :2]
+            inside = (points.epoch_gps_ns >= first) & (points.epoch_gps_ns < end)
+            whole = points.tiles[inside].astype(np.int64) * tile_quanta + points.quanta[inside, :2]
             easting, northing = (whole * np.float64(QUANTUM_M)).T
-            yield points.epoch_gps_ns[own], easting, northing, points.quanta[own, 2]
+            yield points.epoch_gps_ns[inside], easting, northing, points.quanta[inside, 2]
 
 
 def _comments(plan: SurveyPlan, source: ReadingSource, lane_pass: LanePass) -> tuple[str, ...]:

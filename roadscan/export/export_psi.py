@@ -133,10 +133,10 @@ class _PsiWriter:
                 self._take(batch.slice(start, end - start), (int(piece[start]), bool(lit[start])))
 
     def _take(self, part: pa.RecordBatch, piece: tuple[int, bool]) -> None:
-        held = sum(e.size for e, _, _ in self._held)
+        waiting = sum(e.size for e, _, _ in self._held)
         epochs = part.column("epoch_gps_ns").to_numpy()
-        full = 3 * self.geometry.readings * (held + epochs.size) > _PIECE_BYTES
-        if piece != self._piece or full or (held and epochs[0] < self._held[-1][0][-1]):
+        full = 3 * self.geometry.readings * (waiting + epochs.size) > _PIECE_BYTES
+        if piece != self._piece or full or (waiting and epochs[0] < self._held[-1][0][-1]):
             self.flush()
         self._piece = piece
         self._held.append((epochs, _lists(part, "range"), _lists(part, "intensity") if piece[1] else None))

@@ -152,7 +152,7 @@ def _has_place(row: Row) -> bool:
 def _item(row: Row) -> dict[str, Any]:
     values, place = row.values, row.place
     bounds = [] if place is None else [round(v, 8) for v in place.bounds]
-    told = ("state", "version", "rig", "driven_km", "lane_km", "mri_m_per_km", "sigma_down_m", "sigma_horizontal_m")
+    columns = ("state", "version", "rig", "driven_km", "lane_km", "mri_m_per_km", "sigma_down_m", "sigma_horizontal_m")
     links = [{"rel": rel, "href": "../collection.json", "type": "application/json"} for rel in _UP]
     return {
         "type": "Feature", "stac_version": _STAC, "stac_extensions": [], "id": values["survey"],
@@ -161,7 +161,7 @@ def _item(row: Row) -> dict[str, Any]:
             "title": values["title"] or values["survey"], "datetime": None,
             "start_datetime": _instant(values["first_epoch_gps_ns"]),
             "end_datetime": _instant(values["last_epoch_gps_ns"]),
-            **{f"roadscan:{name}": values.get(name) for name in told},
+            **{f"roadscan:{name}": values.get(name) for name in columns},
         },
         "collection": _ID, "links": links,
         "assets": {"store": {"href": values["store"], "title": "Store of the survey", "roles": ["data"]}},

@@ -12,8 +12,7 @@ import shapely
 from roadscan.core.counted import counted
 from roadscan.core.gpstime import iso_from_gps_ns
 from roadscan.fleet.row import Row
-from roadscan.report.blocks import Block, Drawing, Line, Paragraph, Part, Table
-from roadscan.report.map_page import COLOURS, WIDTH, MapPage
+from roadscan.report.blocks import COLOURS, WIDTH, Block, Drawing, Line, MapPage, Paragraph, Part, Table
 from roadscan.report.page import html_page
 
 _STATES: Final = {"finished": COLOURS[2], "unfinished": COLOURS[5], "failed": COLOURS[1], "not run": COLOURS[6]}
@@ -66,33 +65,33 @@ def _wrong(rows: Sequence[Row]) -> Part:
     if not due:
         return Part("wrong", "What is wrong", [Paragraph("Nothing: each survey's last run finished.")])
     head = ("survey", "state", "failed", "damaged", "why")
-    told = [[str(one[name]) for name in ("survey", "state", "failed", "damaged", "notes")] for one in due]
-    return Part("wrong", "What is wrong", [Table(head, told, numbers=False, most_rows=_MOST_SURVEYS)])
+    lines = [[str(one[name]) for name in ("survey", "state", "failed", "damaged", "notes")] for one in due]
+    return Part("wrong", "What is wrong", [Table(head, lines, numbers=False, most_rows=_MOST_SURVEYS)])
 
 
 def _years(rows: Sequence[Row]) -> Part:
     """Return lengths and condition of the network by year; a lane counts as often as it was driven."""
     years = sorted({int(row.values["year"]) for row in rows if row.values.get("year") is not None})
-    told = []
+    lines = []
     for year in years:
-        own = [row.values for row in rows if row.values.get("year") == year]
-        told.append(
+        of_year = [row.values for row in rows if row.values.get("year") == year]
+        lines.append(
             [
-                str(year), str(len(own)), _sum(own, "driven_km"), _sum(own, "lane_km"),
-                _mean(own, "mri_m_per_km", "mri_km", ".2f"), _mean(own, "rut_depth_mean_mm", "lane_km", ".1f"),
-                _mean(own, "cracked_wheel_path_percent", "lane_km", ".1f"),
+                str(year), str(len(of_year)), _sum(of_year, "driven_km"), _sum(of_year, "lane_km"),
+                _mean(of_year, "mri_m_per_km", "mri_km", ".2f"), _mean(of_year, "rut_depth_mean_mm", "lane_km", ".1f"),
+                _mean(of_year, "cracked_wheel_path_percent", "lane_km", ".1f"),
             ]
         )  # fmt: skip
     head = ("year", "surveys", "km driven", "lane km", "MRI (m/km)", "rut (mm)", "cracked (%)")
     caption = "Means are weighted by length. A lane that was driven twice in a year counts twice."
-    blocks: list[Block] = [Table(head, told, caption)] if told else []
+    blocks: list[Block] = [Table(head, lines, caption)] if lines else []
     return Part("years", "By year", blocks)
 
 
 def _surveys(rows: Sequence[Row]) -> Part:
     figures = ("km", "lane km", "σ height (mm)", "MRI (m/km)")
     head = ("survey", "title", "state", "from", "rig", *figures, "version")
-    told = [
+    lines = [
         [
             str(one["survey"]), str(one["title"]), str(one["state"]), _day(one.get("first_epoch_gps_ns")),
             str(one["rig"]), _shown(one.get("driven_km"), ",.2f"), _shown(one.get("lane_km"), ",.2f"),
@@ -101,8 +100,8 @@ def _surveys(rows: Sequence[Row]) -> Part:
         ]
         for one in (row.values for row in rows)
     ]  # fmt: skip
-    table = Table(head, told, full_table="fleet", numbers=False, most_rows=_MOST_SURVEYS)
-    return Part("surveys", "All surveys", [table] if told else [])
+    table = Table(head, lines, full_table="fleet", numbers=False, most_rows=_MOST_SURVEYS)
+    return Part("surveys", "All surveys", [table] if lines else [])
 
 
 def _day(epoch_gps_ns: int | None) -> str:

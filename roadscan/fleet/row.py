@@ -77,27 +77,27 @@ def row_key(found: Found, notes: Sequence[str]) -> str:
 
 def row_of(found: Found, notes: Sequence[str]) -> Row:
     """Return the row of a survey; `notes` are known of it already. Damage is counted and noted, and raises nothing."""
-    told = _Told([*([found.fault] if found.fault else []), *notes])
+    faults = _Told([*([found.fault] if found.fault else []), *notes])
     values: dict[str, Any] = {
         "survey": found.id, "title": "", "survey_file": found.file, "store": "", "state": "not run", "failed": 0,
         "version": "", "rig": "", "sensors": "", "runs": 0, "logs": 0, "map_crs": "", "key": row_key(found, notes),
     }  # fmt: skip
     if found.survey is not None:
         values |= {"title": found.survey.config.title, "rig": found.survey.rig.name}
-    place = None if found.store is None else _of_store(found, found.store, values, told)
-    values |= {"damaged": len(told.damaged), "notes": told.words()}
+    place = None if found.store is None else _of_store(found, found.store, values, faults)
+    values |= {"damaged": len(faults.damaged), "notes": faults.words()}
     return Row(values, place)
 
 
-def _of_store(found: Found, store: Store, values: dict[str, Any], told: _Told) -> shapely.Geometry | None:
+def _of_store(found: Found, store: Store, values: dict[str, Any], faults: _Told) -> shapely.Geometry | None:
     """Fill in what the store tells, and return the survey's place."""
     values["store"] = store.root
     try:
         wanted = found.member().logs
-        manifest = Manifest(store, told.damaged)
-        logs = [r for r in read_log_records(store, damaged=told.damaged) if wanted is None or r.key in wanted]
+        manifest = Manifest(store, faults.damaged)
+        logs = [r for r in read_log_records(store, damaged=faults.damaged) if wanted is None or r.key in wanted]
     except RoadscanError as error:
-        told.damaged.append(StoreError(str(error)))
+        faults.damaged.append(StoreError(str(error)))
         return None
     failures = read_failures(store)
     done = bool(manifest.table().num_rows or logs)
@@ -109,10 +109,10 @@ def _of_store(found: Found, store: Store, values: dict[str, Any], told: _Told) -
         "runs": len({r.run for r in logs}),
         "logs": len(logs),
     }
-    values |= _of_history(store, told.damaged)
-    values |= _of_trajectories(store, logs, told.damaged)
-    values |= _of_sections(_table(store, manifest, "condition_sections", told.damaged))
-    return _of_tiles(_table(store, manifest, "tile_table", told.damaged), values)
+    values |= _of_history(store, faults.damaged)
+    values |= _of_trajectories(store, logs, faults.damaged)
+    values |= _of_sections(_table(store, manifest, "condition_sections", faults.damaged))
+    return _of_tiles(_table(store, manifest, "tile_table", faults.damaged), values)
 
 
 def _of_history(store: Store, damaged: list[StoreError]) -> dict[str, Any]:
@@ -135,8 +135,8 @@ def _of_trajectories(store: Store, logs: Sequence[LogRecord], damaged: list[Stor
         for file in log.tables.get("trajectory", ()):
             poses = _poses(store, file, damaged)
             if poses is not None:
-                own = log.run, log.sensor
-                lengths_m[own] = lengths_m.get(own, 0.0) + length_m(*poses)
+                key = log.run, log.sensor
+                lengths_m[key] = lengths_m.get(key, 0.0) + length_m(*poses)
     longest: dict[str, float] = {}
     for (run, _), one in lengths_m.items():
         longest[run] = max(longest.get(run, 0.0), one)

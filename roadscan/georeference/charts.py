@@ -1,4 +1,4 @@
-"""Charts approximate the map projection near the vehicle by polynomials.
+"""Charts approximate the map projection near the vehicle, and give kernels what georeferences a sensor's readings.
 
 PROJ places a million points a second; a chart places a hundred times as many. World space is cut into
 boxes of 200 m; about the centre of each box the map coordinates are expanded to second order from 19
@@ -18,6 +18,11 @@ import numpy.typing as npt
 from roadscan.compute.array_types import Float64
 from roadscan.core.crs import LOCAL_WORLD, MapFrame
 from roadscan.core.errors import NavigationError
+from roadscan.core.grid import QUANTA_PER_M
+from roadscan.core.rig import Mounting
+from roadscan.georeference.kernels import charts as kernels
+from roadscan.georeference.kernels.readings import Georeference, Limits
+from roadscan.poses.trajectory import Trajectory
 
 BOX_M = 200.0  # Edge of a box: within 300 m of its centre an expansion errs by less than 2 µm.
 STEP_M = 100.0
@@ -116,3 +121,16 @@ def _chart(frame: MapFrame, world: str, box: tuple[int, int, int]) -> Float64:
         pp, pm, mp, mm = value[7 + 4 * index : 11 + 4 * index]
         out[:, column] = (pp - pm - mp + mm) / (4 * STEP_M**2)
     return out
+
+
+def georeference_of(mounting: Mounting, trajectory: Trajectory, charts: Charts, limits: Limits) -> Georeference:
+    """Return the structure that kernels take, from a mounting, a trajectory, charts and limits."""
+    rotation, lever = mounting.arrays()
+    lattice = tuple(charts.lattice.tolist())
+    return Georeference(
+        mounting=(*rotation.ravel().tolist(), *lever.tolist()),
+        poses=trajectory.intervals,
+        charts=kernels.Charts(lattice, charts.table, charts.centres, charts.coefficients),
+        limits=limits,
+        quanta_per_m=float(QUANTA_PER_M),
+    )

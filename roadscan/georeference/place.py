@@ -27,10 +27,9 @@ from roadscan.core.grid import QUANTA_PER_M
 from roadscan.core.ids import LanePass
 from roadscan.core.rig import Mounting, Mountings
 from roadscan.core.scan_geometry import ScanGeometry
-from roadscan.georeference.charts import Charts
+from roadscan.georeference.charts import Charts, georeference_of
 from roadscan.georeference.classes import KEPT, NOT_ROAD, READING_CLASSES, TOO_HIGH, TOO_LOW
 from roadscan.georeference.flat_profiles import EVERY_RAW_RANGE, flat_profiles
-from roadscan.georeference.georeference import georeference_of
 from roadscan.georeference.kernels import readings as kernels
 from roadscan.georeference.kernels.flat_profiles import georeference_flat_profiles
 from roadscan.georeference.kernels.readings import FATES, Georeference, Limits, MirrorProfiles, Points, Returns

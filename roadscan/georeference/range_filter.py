@@ -10,13 +10,12 @@ planes of two successive scans that differ in heading by Δθ cross at the dista
 on its inner side. Nearer, the profiles cover the road in the order of driving. Beyond, they cover it again, the other
 way round, and where they lie around the crossing, one spot is read from many poses. On the outer side profiles fan
 out: they never overlap, and all readings are kept. A resolution of the scanner would cut every profile, straight
-ones too, at Δs / sin 0.5° (3.4 m at 3 cm a profile); :func:`resolution_limits` gives that reading of the paper for
-comparison, for turns alone.
+ones too, at Δs / sin 0.5° (3.4 m at 3 cm a profile).
 
 r · cos θ is the reading's horizontal distance from the sensor across the path.
 
-Heading and path are taken over at least `base_m` of path, centred, so that the noise of successive headings is no
-turn. A vehicle that stands has no arc: it is not turning.
+``georeference.turns`` takes heading and path over at least `base_m` of path, so that the noise of
+successive headings is no turn. A vehicle that stands has no arc: it is not turning.
 """
 
 from __future__ import annotations
@@ -27,17 +26,6 @@ import numpy as np
 
 from roadscan.compute.array_types import Bool, Float64
 from roadscan.core.settings.segmentation import RangeFilter
-
-
-def crossing_limits(path_m: Float64, heading_rad: Float64, settings: RangeFilter) -> Float64:
-    """Return how far (n, 2) to the left and right of the path readings are kept (m); infinite outside turns.
-
-    Parameters
-    ----------
-    path_m : (n,) position of each profile along the sensor's path (m), not decreasing.
-    heading_rad : (n,) heading of each profile, clockwise positive; whole turns do not matter.
-    """
-    return limits_of_turns(*_arc_and_turn(path_m, heading_rad, settings.base_m), settings)
 
 
 def limits_of_turns(arc_m: Float64, turn_rad: Float64, settings: RangeFilter) -> Float64:
@@ -52,23 +40,7 @@ def limits_of_turns(arc_m: Float64, turn_rad: Float64, settings: RangeFilter) ->
     return limits
 
 
-def resolution_limits(path_m: Float64, heading_rad: Float64, resolution_rad: float, settings: RangeFilter) -> Float64:
-    """Return limits (n, 2) with the scanner's resolution in place of the turn, as the paper words it; only in turns."""
-    arc = np.diff(path_m, append=path_m[-1:] + (path_m[-1] - path_m[-2] if path_m.size > 1 else 0.0))
-    turning = np.isfinite(crossing_limits(path_m, heading_rad, settings)).any(axis=1)
-    critical = np.where(turning & (arc > 0.0), arc / math.sin(resolution_rad), np.inf)
-    return np.stack([critical, critical], axis=-1)
-
-
 def kept_in_turns(across_m: Float64, limits_m: Float64) -> Bool:
     """Which readings (n, m) are kept, by their horizontal distance across the path (n, m), right positive (m)."""
     kept: Bool = (across_m >= -limits_m[:, :1]) & (across_m <= limits_m[:, 1:])
     return kept
-
-
-def _arc_and_turn(path_m: Float64, heading_rad: Float64, base_m: float) -> tuple[Float64, Float64]:
-    """Return path (n,) and change of heading (n,) over at least `base_m` around each profile; less at the ends."""
-    turned = np.unwrap(heading_rad)
-    first = np.maximum(np.searchsorted(path_m, path_m - base_m / 2, side="right") - 1, 0)
-    last = np.minimum(np.searchsorted(path_m, path_m + base_m / 2, side="left"), path_m.size - 1)
-    return path_m[last] - path_m[first], turned[last] - turned[first]

@@ -14,8 +14,7 @@ from roadscan.compute.kernel_options import read_only
 from roadscan.core.grid import QUANTA_PER_M
 from roadscan.core.rig import Mounting, Mountings
 from roadscan.core.scan_geometry import ScanGeometry
-from roadscan.georeference.charts import Charts
-from roadscan.georeference.georeference import georeference_of
+from roadscan.georeference.charts import Charts, georeference_of
 from roadscan.georeference.kernels.block_ranges import block_ranges
 from roadscan.georeference.kernels.reach import SpannedProfiles, reach_of_profiles, reach_of_returns
 from roadscan.georeference.kernels.readings import Georeference, Limits

@@ -35,8 +35,7 @@ from roadscan.georeference.road_profiles import RoadFinder
 from roadscan.georeference.turns import TICK_NS, WINDOW_NS
 from roadscan.ingest.clocks.correction import ClockCorrection
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded, load_trajectory
-from roadscan.poses.mounting_change import MountingChange
-from roadscan.poses.movement import NO_CORRECTION, Allowance
+from roadscan.poses.movement import NO_CORRECTION, Allowance, MountingChange
 from roadscan.poses.trajectory import Trajectory
 from roadscan.store.logs import DataFile
 from roadscan.store.readings.returns import distances_m

@@ -17,8 +17,7 @@ from roadscan.core.kept import sources_digest
 from roadscan.core.plugins import added
 from roadscan.ingest.inspect.diagnosis import cannot_be_opened, claimed_format, is_there
 from roadscan.ingest.reading.format import ENTRY_POINT_GROUP, LogFormat, format_alone
-from roadscan.store.checked_json import checked_json, parse_checked
-from roadscan.store.digest import digest_holds, file_digest
+from roadscan.store.digest import checked_json, digest_holds, file_digest, parse_checked
 from roadscan.store.store import Store
 
 _SOURCES: Final = "manifest/sources.json"

@@ -164,7 +164,7 @@ def _heights_around(state: State, place_m: npt.NDArray[np.float64]) -> npt.NDArr
 
 
 def _circles(changes: Changes, state: State) -> Iterator[EditFault]:
-    """Yields faults for assets that are, through a chain of parents, their own parents."""
+    """Yields faults for assets to which a chain of their parents leads back."""
     given = {c.asset_id: c for c in changes.changed if c.attribute == "parent" and c.new is not None}
     if not given:
         return

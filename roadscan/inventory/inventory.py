@@ -17,13 +17,12 @@ from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.extras import needed
 from roadscan.core.gpstime import now_utc
 from roadscan.core.witness import Finding
-from roadscan.inventory.changes import EpochChanges, epoch_changes
+from roadscan.inventory.changes import EpochChanges, Event, epoch_changes, history_of
 from roadscan.inventory.checks import faults_of
 from roadscan.inventory.comparing import Changes, compared, published_rows, published_table
 from roadscan.inventory.conflicts import Conflict, conflict_rows, conflicts_of
 from roadscan.inventory.diff import Differences, differences
 from roadscan.inventory.edits import Edit, edit_rows
-from roadscan.inventory.history import Event, history_of
 from roadscan.inventory.home import FID, Author, Content, EditFault, Home, HomeError, Mark, Sheet
 from roadscan.inventory.homes.page_edits import EditOutcome, PageDocument, PageEdits
 from roadscan.inventory.pulling import Pulling, clocked, new_edits, refuse

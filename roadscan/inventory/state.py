@@ -52,7 +52,7 @@ class Assets:
 
     @cached_property
     def shapes(self) -> npt.NDArray[Any]:
-        """Returns geometries as people see them, in the map's own unit."""
+        """Returns geometries as people see them, in the map's unit."""
         return np.asarray(shapely.from_wkb(self.rows[GEOMETRY].to_numpy(zero_copy_only=False)))
 
 

@@ -49,7 +49,7 @@ def footprint(
 ) -> Footprint:
     """Return what a picture shows of the ground within a reach of the camera, on the map.
 
-    Rays that meet no surveyed ground are held against a level plane at the height of the road below the camera; those
+    Rays that meet no surveyed ground are compared with a level plane at the height of the road below the camera; those
     that rise or go farther end at the reach. Where no ground is surveyed there, that plane lies `above_road_m` below.
     """
     place = poses.place_m[number]

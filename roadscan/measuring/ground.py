@@ -25,7 +25,7 @@ from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE
 T = TypeVar("T")
 
 _COARSE_M: Final = 0.21
-"""Largest edge (m) of the pixels that rays are first held against."""
+"""Largest edge (m) of the pixels that rays are first compared with."""
 _KEPT_TILES: Final = 48  # Tiles whose coarse heights stay in memory.
 _KEPT_CELLS: Final = 6  # Tiles whose cells stay in memory: up to 100 MB each.
 _RADII_M: Final = (0.06, 0.12, 0.25, 0.5, 1.0)

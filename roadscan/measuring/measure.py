@@ -173,8 +173,8 @@ def length_of(places: Sequence[MeasuredPlace]) -> tuple[float, float]:
     pull[1:] += ways
     pull[:-1] -= ways
     common = sum((p @ one.common_m for p, one in zip(pull, places, strict=True)), np.zeros(_COMMON))
-    own = [p @ (one.covariance_m2 - one.common_m @ one.common_m.T) @ p for p, one in zip(pull, places, strict=True)]
-    return float(lengths.sum()), math.sqrt(max(float(common @ common) + math.fsum(own), 0.0))
+    alone = [p @ (one.covariance_m2 - one.common_m @ one.common_m.T) @ p for p, one in zip(pull, places, strict=True)]
+    return float(lengths.sum()), math.sqrt(max(float(common @ common) + math.fsum(alone), 0.0))
 
 
 def measured_places(

@@ -46,7 +46,7 @@ def write_geojson_of(path: Path, measured: Measured, frame: MapFrame) -> int:
 def geojson_of(measured: Measured, frame: MapFrame) -> dict[str, Any]:
     """Return the line through measured places as GeoJSON, or the point of one.
 
-    Longitude and latitude are in WGS 84 by RFC 7946 where the map has a CRS, else they are the map's own metres;
+    Longitude and latitude are in WGS 84 by RFC 7946 where the map has a CRS, else they are the map's metres;
     heights stay as the map has them. Properties hold picture, camera, run, length, and place and 1 σ of each vertex.
 
     Raises

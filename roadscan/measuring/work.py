@@ -13,8 +13,7 @@ import numpy.typing as npt
 from roadscan.core.grid import Bounds
 from roadscan.georeference.plan.plan import SurveyPlan, pictures_plan_of
 from roadscan.measuring.ground import Ground
-from roadscan.measuring.layer import PictureRows
-from roadscan.measuring.listed import ListedPictures, Unplaced, listed_pictures
+from roadscan.measuring.layer import ListedPictures, PictureRows, Unplaced, listed_pictures
 from roadscan.measuring.measure import survey_ground
 from roadscan.measuring.poses import PicturePoses
 from roadscan.measuring.settings import PicturesConfig

@@ -62,6 +62,6 @@ def post_process(rover: Path, options: PpkOptions, out: Path) -> PpkResult:
 
 
 def _stated(rover: Path, base: Mapping[str, Any]) -> str:
-    """Return comments that name the datum, which RTKLIB's own header calls WGS84 whatever it is."""
+    """Return comments that name the datum, which RTKLIB's header calls WGS84 whatever it is."""
     epoch = f", epoch {base['epoch']:g}" if "epoch" in base else ""
     return f"% rover     : {rover.name}\n% datum     : that of the base's position, {base['crs']}{epoch}\n"

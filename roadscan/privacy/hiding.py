@@ -16,7 +16,7 @@ KINDS: Final = ("vehicle", "person", "detected")
 
 
 _CELLS: Final = 6
-"""The longer side of what is hidden keeps so many mean colours: a face or a plate cannot be told from them."""
+"""The longer side of what is hidden keeps so many mean colours: a face or a plate cannot be distinguished from them."""
 _LEAST_CELL_PX: Final = 8.0  # Edge of the area of a mean colour at least (pixels).
 _BEYOND_PX: Final = 2.0  # What is hidden is wider by so much at least, for edges that are not sharp (pixels).
 

@@ -39,7 +39,7 @@ _STAYS_S: Final = 1.0
 _CUBE_M: Final = 0.5  # Edge of such a cube (m).
 _ONE_THING_M: Final = 0.7
 """Returns nearer to each other belong to one thing (m)."""
-_GRAIN_M: Final = 0.25  # Edge of the cubes that stand for the returns in them when things are told apart (m).
+_GRAIN_M: Final = 0.25  # Edge of the cubes that stand for the returns in them when things are distinguished (m).
 _AROUND_M: Final = 0.25
 """Around each return so much is hidden: scanners leave gaps, and glass returns nothing (m)."""
 _KEPT_SQUARES: Final = 12  # Squares whose returns stay in memory.

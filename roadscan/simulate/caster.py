@@ -76,7 +76,7 @@ class Hits:
     """(g, m) True where the range is a mixture: the point is then in the ray's middle, and on nothing."""
     part: npt.NDArray[np.int8]
     """(g, m) class of the body met, where it is another than its object's; 0: it is not, or none was met. Numbers of
-    :mod:`roadscan.simulate.semantics`."""
+    :mod:`roadscan.simulate.bodies`."""
     body: npt.NDArray[np.int32] | None = None
     """(g, m) body met, numbers of moving ones follow on those of the world; −1: none."""
     movers: kernels.Movers | None = None

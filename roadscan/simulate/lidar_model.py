@@ -91,7 +91,7 @@ class Figures(Strict):
     capture: Literal["velodyne", "ouster", "hesai"] | None = None
     """Whose packets a capture without a bag has; none: only a bag records it."""
     columns: int | None = None
-    """Columns of a turn, where the maker counts them: a capture then begins each at its own angle."""
+    """Columns of a turn, where the maker counts them: a capture then begins each at its angle."""
     errors: ModelErrors
     """How it errs."""
 

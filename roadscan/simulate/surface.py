@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from roadscan.compute.array_types import Float32, Float64, Int64
-from roadscan.simulate import features, roughness
+from roadscan.simulate import features, noise
 from roadscan.simulate.kernels import road as kernels
 from roadscan.simulate.kernels.road import NODE_STEP_M, RoadArrays
 from roadscan.simulate.noise import stream
@@ -139,7 +139,7 @@ def _section(road: Road, tracks: Float64, first_m: float, textured: bool, seed: 
     """Return constants and ruts as in :class:`RoadArrays`; no ruts in the smooth surface."""
     shades = road.brightness
     shoulder = road.shoulder_width_m / 2 if road.shoulder_width_m > 0.0 else 0.25
-    offsets = roughness.track_offsets_m(road)
+    offsets = noise.track_offsets_m(road)
     contrast = 0.0
     if textured and road.texture is not None:
         contrast = road.texture.contrast / float(_texture(road, seed).std())
@@ -155,7 +155,7 @@ def _section(road: Road, tracks: Float64, first_m: float, textured: bool, seed: 
     constants[kernels.TRACK_FIRST] = offsets[0]
     constants[kernels.TRACK_PER_M] = 1.0 / float(offsets[1] - offsets[0])
     constants[kernels.TRACK_STATION] = first_m
-    constants[kernels.TRACK_STATION_PER_M] = 1.0 / roughness.STEP_M
+    constants[kernels.TRACK_STATION_PER_M] = 1.0 / noise.STEP_M
     constants[kernels.TEXTURE_PER_M] = 1.0 / CELL_M
     constants[kernels.CONTRAST] = contrast
     constants[kernels.ASPHALT : kernels.KERB + 1] = [
@@ -181,13 +181,13 @@ def _texture(road: Road, seed: int) -> npt.NDArray[np.float32]:
 
 def _tracks(scene: Scene, station: Float64, ride: bool) -> tuple[Float64, float]:
     """Return unevenness (t, s), and the station of its first sample; only its long waves in the smooth surface."""
-    step = roughness.STEP_M
+    step = noise.STEP_M
     first = float(station[0]) - 3 * step
     fine: Float64 = first + step * np.arange(math.ceil((float(station[-1]) - first) / step) + 4, dtype=np.float64)
     waves = np.zeros(fine.size)
     for wave in scene.road.waves:
         waves += wave.amplitude_m * np.sin(2 * math.pi / wave.wavelength_m * fine + math.radians(wave.phase_deg))
-    found = roughness.tracks(scene.road, fine, waves, stream(scene.seed, 0, "roughness"))
+    found = noise.tracks(scene.road, fine, waves, stream(scene.seed, 0, "roughness"))
     if ride and found.size:
         # Half of the amplitude of waves of RIDE_WAVELENGTH_M remains.
         sigma_m = RIDE_WAVELENGTH_M * math.sqrt(math.log(2.0) / 2.0) / math.pi

@@ -14,7 +14,11 @@ import pyarrow as pa
 from roadscan.compute.array_types import Float64
 from roadscan.simulate.bodies import (
     BURIED_M,
+    MADE,
     PIECE_M,
+    SIGN,
+    TRUNK,
+    WALL,
     Assembly,
     Place,
     along,
@@ -26,7 +30,6 @@ from roadscan.simulate.bodies import (
     rod_row,
     walls,
 )
-from roadscan.simulate.furniture import MADE
 from roadscan.simulate.kernels import things as body
 from roadscan.simulate.kernels.road import STATION
 from roadscan.simulate.scene import Scene
@@ -55,7 +58,6 @@ from roadscan.simulate.scene.roadside import (
     Wall,
     Wire,
 )
-from roadscan.simulate.semantics import SIGN, TRUNK, WALL
 from roadscan.simulate.surface import Surface
 from roadscan.simulate.vehicles import SIZES_M, vehicle_bodies
 

@@ -10,8 +10,7 @@ from typing import Final
 import numpy as np
 
 from roadscan.compute.array_types import Float64
-from roadscan.simulate.bodies import Assembly, Place
-from roadscan.simulate.semantics import PERSON
+from roadscan.simulate.bodies import PERSON, Assembly, Place
 
 SIZES_M: Final = {
     "car": (4.4, 1.8, 1.5), "van": (5.4, 2.0, 2.4), "lorry": (8.5, 2.5, 3.6), "bicycle": (1.75, 0.6, 1.05),

@@ -67,7 +67,7 @@ class Access(Strict):
     address: str
     """Where people see the page: `https://roads.example.org`. The proxy leaves out what comes after the host."""
     listen: str = "127.0.0.1"
-    """Address that the server listens on: a proxy on another host, or in a container of its own, needs `0.0.0.0`."""
+    """Address that the server listens on: a proxy on another host, or in a separate container, needs `0.0.0.0`."""
     user_header: str = "X-Forwarded-User"
     """Header in which the proxy says who asks."""
     groups_header: str = "X-Forwarded-Groups"
@@ -111,10 +111,10 @@ class Access(Strict):
 
     def asker(self, headers: Message, secret: str) -> Asker | None:
         """Return who sent a request; None for one that did not come through the proxy, or of someone without a role."""
-        told = [headers.get_all(one, [""]) for one in (SECRET_HEADER, self.user_header, self.groups_header)]
-        if any(len(one) != 1 for one in told):  # A proxy that adds a header has left that of the browser beside it.
+        values = [headers.get_all(one, [""]) for one in (SECRET_HEADER, self.user_header, self.groups_header)]
+        if any(len(one) != 1 for one in values):  # A proxy that adds a header has left that of the browser beside it.
             return None
-        given, name, named_groups = (one[0].strip() for one in told)
+        given, name, named_groups = (one[0].strip() for one in values)
         if not hmac.compare_digest(given.encode("utf-8", "replace"), secret.encode()):
             return None
         if name and (_NAME.fullmatch(name) is None or name.startswith(_GROUP) or name == _EVERYONE):

@@ -67,8 +67,8 @@ class EditDoor:
             session = self._open()
             document: PageDocument = page_document(session, "the page", content).by(who)
             pulled, outcomes = truth_of(session).pull_page(document, sound=True)
-        told = [one._asdict() for one in outcomes]
-        return {"commit": pulled.commit, "edits": told, "conflicts": pulled.conflicts}
+        results = [one._asdict() for one in outcomes]
+        return {"commit": pulled.commit, "edits": results, "conflicts": pulled.conflicts}
 
 
 _MOST_PIXELS: Final = 1000  # Corners of a line.
@@ -178,15 +178,15 @@ class MeasuringDoor:
         place = row["easting_m"], row["northing_m"], row["height_m"]
         seen = pictures_of_place(session, *place, sigma_m=(level, level, height))
         others = [one for one in plan.records if plan.survey.resolve(Path(one.path)) != self._clicked.file.resolve()]
-        held = measured_points(session.store, others, plan.survey.rig).rows.to_pylist()
-        elsewhere = {_measured(one)["picture"]: _measured(one) for one in held if one["point"] == row["name"]}
+        measured = measured_points(session.store, others, plan.survey.rig).rows.to_pylist()
+        elsewhere = {_measured(one)["picture"]: _measured(one) for one in measured if one["point"] == row["name"]}
         names = ("name", "u_px", "v_px", "sigma_u_px", "sigma_v_px", "distance_m", "resolution_m")
         poses = posed_pictures(session)
         found = []
         for one in seen[:_MOST_PICTURES]:
             assumed = poses.assumed(picture_number(poses.pictures, one.name, plan))
-            told = {name: getattr(one, name) for name in names}
-            found.append(told | {"assumed": assumed, "elsewhere": elsewhere.get(one.name)})
+            figures = {name: getattr(one, name) for name in names}
+            found.append(figures | {"assumed": assumed, "elsewhere": elsewhere.get(one.name)})
         return found
 
     def _missing(self) -> list[dict[str, str]]:

@@ -1,13 +1,14 @@
-"""Vector layers: their description, and all kinds of them: modules of `site/layers/`, and entry points."""
+"""Vector layers of `site/layers/` and of entry points: their description, and the evidence for a feature."""
 
 from __future__ import annotations
 
 import bisect
 import functools
+import json
 import math
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Final, Literal
 
@@ -15,8 +16,10 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
+from roadscan.core.errors import RoadscanError
 from roadscan.core.plugins import found_kinds
 from roadscan.site.material import Material
+from roadscan.site.site_pictures import cut_out_records, cut_out_url, picture_urls
 from roadscan.store.schema import table_schema
 
 ENTRY_POINT_GROUP: Final = "roadscan.site_layers"
@@ -194,13 +197,13 @@ def table_layer(material: Material, table: str, about: SiteLayer) -> Iterator[Si
 
     There is none where the survey has no such rows, or where the inventory shows them with its edits.
     """
-    held = None if table in material.tables_in_inventory else material.table(table)
-    if held is None or held.shapes_m is None or not held.rows.num_rows:
+    content = None if table in material.tables_in_inventory else material.table(table)
+    if content is None or content.shapes_m is None or not content.rows.num_rows:
         return
-    names = [f.name for f in held.rows.schema if not _is_list(f)]
-    rows = held.rows.select(names).to_pylist()
+    names = [f.name for f in content.rows.schema if not _is_list(f)]
+    rows = content.rows.select(names).to_pylist()
     yield SiteLayer(
-        about.name, about.title, about.group, about.geometry, about.order, held.shapes_m, rows,
+        about.name, about.title, about.group, about.geometry, about.order, content.shapes_m, rows,
         schema_columns(table, names), about.styles, about.key, about.label, about.visible, about.arrows,
         [list(evidence_of_row(row)) for row in rows],
     )  # fmt: skip
@@ -230,3 +233,60 @@ def evidence_of_row(row: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
 
 def _is_list(column: Any) -> bool:
     return str(column.type).startswith(("list", "fixed_size_list"))
+
+
+Told = dict[str, Any]
+
+
+def of_pictures(material: Material, row: Mapping[str, Any]) -> Iterator[Told]:
+    """Yield the cut-out of an asset, and the pictures of its column `pictures`, best first."""
+    name = row.get("cut_out")
+    cut = cut_out_records(material).get(str(name)) if name else None
+    if cut is not None:
+        yield {"title": "cut-out", "kind": "cut_out", "url": cut_out_url(cut)}
+    pictures = _pictures_named(row.get("pictures"))
+    urls = picture_urls(material) if pictures else {}
+    for one in pictures:
+        names = str(one.get("run")), str(one.get("camera")), str(one.get("file"))
+        url, distance = urls.get(names), one.get("distance_m")
+        away = f", {distance:g} m away" if isinstance(distance, int | float) else ""
+        words = {"title": f"picture {' '.join(names)}{away}", "kind": "picture"}
+        yield words | ({} if url is None else {"url": url})
+
+
+def _pictures_named(text: Any) -> list[Mapping[str, Any]]:
+    try:
+        named = json.loads(text) if isinstance(text, str) else []
+    except ValueError:
+        return []
+    return [one for one in named if isinstance(one, dict)] if isinstance(named, list) else []
+
+
+def of_passes(material: Material, epochs_gps_ns: Iterable[Any], run: str | None = None) -> Iterator[Told]:
+    """Yield the passes at some epochs, of one run where it is named."""
+    wanted = [one for one in epochs_gps_ns if isinstance(one, int)]
+    for driven in material.plan.passes if wanted else ():
+        if run in (None, driven.run) and any(driven.start_gps_ns <= one < driven.end_gps_ns for one in wanted):
+            yield of_pass(material, driven.pass_id)
+
+
+def of_pass(material: Material, number: int) -> Told:
+    """Return a pass by its number; its row in the layer of passes names its logs."""
+    run = next((one.run for one in material.plan.passes if one.pass_id == number), None)
+    title = f"pass {number}" + (f" of {run}" if run else "")
+    return {"title": title, "kind": "row", "layer": "passes", "row": str(number)}
+
+
+def of_run(material: Material, run: str) -> Iterator[Told]:
+    """Return the logs of a run."""
+    for record in _records(material):
+        if record.run == run:
+            yield {"title": f"{record.sensor}: {record.path} ({record.format}, {record.rows:,} rows)", "kind": "log"}
+
+
+@functools.lru_cache(maxsize=2)
+def _records(material: Material) -> tuple[Any, ...]:
+    try:
+        return tuple(material.plan.records)
+    except RoadscanError:
+        return ()

@@ -247,15 +247,15 @@ def box_of_road(material: Material, road: str) -> Box:
     ConfigError
         where the survey has no such road.
     """
-    held = material.table("reference_lines")
-    known = [] if held is None else [str(name) for name in held.rows.column("road").to_pylist()]
-    if held is None or held.shapes_m is None or road not in known:
+    content = material.table("reference_lines")
+    known = [] if content is None else [str(name) for name in content.rows.column("road").to_pylist()]
+    if content is None or content.shapes_m is None or road not in known:
         raise ConfigError(
             f"there is no road '{road}'{nearest(road, known)}",
             expected=", ".join(known) or "a survey with the stage condition, which finds the roads",
             change="name a --box instead",
         )
-    west, south, east, north = (float(v) for v in held.shapes_m[known.index(road)].bounds)
+    west, south, east, north = (float(v) for v in content.shapes_m[known.index(road)].bounds)
     return west - BESIDE_ROAD_M, south - BESIDE_ROAD_M, east + BESIDE_ROAD_M, north + BESIDE_ROAD_M
 
 

@@ -2,7 +2,7 @@
 
 It listens on a loopback address. It answers GET and HEAD, whole or by one range (RFC 9110, 14), for paths that the site
 names; no path reaches the file system. A request that names another host is refused, so that no page of another origin
-reads the survey by a name that resolves to this machine. Where it has doors, it answers POST from its own page: what
+reads the survey by a name that resolves to this machine. Where it has doors, it answers POST from its page: what
 changes nothing as it is, and what writes with a token that stands in no document. Behind a proxy (`access.py`), it
 answers only those whom the file of access names.
 """
@@ -159,9 +159,9 @@ class _Handler(BaseHTTPRequestHandler):
             return
         commit = answer.get("commit")
         self._told(door, asker, "taken" if commit is None else f"taken: commit {commit}")
-        told = json_bytes(answer)
-        self._head(HTTPStatus.OK, "answer.json", {"Content-Length": str(len(told))})
-        self.wfile.write(told)
+        body = json_bytes(answer)
+        self._head(HTTPStatus.OK, "answer.json", {"Content-Length": str(len(body))})
+        self.wfile.write(body)
 
     def _asker(self) -> Asker | None:
         """Return who asks; None where they may see nothing. Without a proxy it is the person at this machine."""
@@ -215,15 +215,15 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _refuse_method(self) -> None:
         self.close_connection = True  # an unread body may follow
-        told = "documents are taken at their addresses alone" if self.server.doors else "this server is read-only"
-        self._text(HTTPStatus.METHOD_NOT_ALLOWED, told, {"Allow": "GET, HEAD"})
+        words = "documents are taken at their addresses alone" if self.server.doors else "this server is read-only"
+        self._text(HTTPStatus.METHOD_NOT_ALLOWED, words, {"Allow": "GET, HEAD"})
 
     def _answer(self, *, with_body: bool) -> None:
         if self._asker() is None:
-            told = (HTTPStatus.MISDIRECTED_REQUEST, "ask for the address that roadscan printed")
+            refusal = (HTTPStatus.MISDIRECTED_REQUEST, "ask for the address that roadscan printed")
             if self.server.access is not None:
-                told = (HTTPStatus.FORBIDDEN, "the file of access does not name you, or this is not the proxy's way")
-            self._text(*told, with_body=with_body)
+                refusal = (HTTPStatus.FORBIDDEN, "the file of access does not name you, or this is not the proxy's way")
+            self._text(*refusal, with_body=with_body)
             return
         path = unquote(urlsplit(self.path).path, errors="replace") if len(self.path) < _LONGEST_HEAD else ""
         found = _PATH.fullmatch(path)
@@ -257,10 +257,14 @@ class _Handler(BaseHTTPRequestHandler):
                     {"Content-Range": f"bytes */{size}"}, with_body=with_body,
                 )  # fmt: skip
                 return
-            told = {"ETag": tag, "Accept-Ranges": "bytes", "Content-Length": str(size if span is None else len(span))}
+            headers = {
+                "ETag": tag,
+                "Accept-Ranges": "bytes",
+                "Content-Length": str(size if span is None else len(span)),
+            }
             if span is not None:
-                told["Content-Range"] = f"bytes {span.start}-{span.stop - 1}/{size}"
-            self._head(HTTPStatus.OK if span is None else HTTPStatus.PARTIAL_CONTENT, name, told)
+                headers["Content-Range"] = f"bytes {span.start}-{span.stop - 1}/{size}"
+            self._head(HTTPStatus.OK if span is None else HTTPStatus.PARTIAL_CONTENT, name, headers)
             if with_body:
                 self._copy(stream, range(size) if span is None else span)
 

@@ -59,7 +59,7 @@ def write_single(
         for wished, without in _ever_less(material):
             if without:
                 left_out.append(without)
-            held = publish(wished, folder, report)
+            published = publish(wished, folder, report)
             size = round(sum(_size(file) for file in _inside(folder)) + len(page))
             if size <= largest_mb * 1e6:
                 break
@@ -71,7 +71,7 @@ def write_single(
         _write(path, page, folder)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-    failed = [f"{document}: {why}" for document, why in held.failures]
+    failed = [f"{document}: {why}" for document, why in published.failures]
     return SinglePage(path, path.stat().st_size, (*left_out, *failed))
 
 

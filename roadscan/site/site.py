@@ -24,9 +24,8 @@ from roadscan.site.parts.catalog import from_longitude_latitude, to_longitude_la
 from roadscan.site.parts.vectors import site_layers
 from roadscan.site.report_copy import REPORT, linked_report
 from roadscan.site.web_part import web_documents
-from roadscan.store.checked_json import checked_json, parse_checked
 from roadscan.store.codecs import SOFTWARE
-from roadscan.store.digest import file_digest
+from roadscan.store.digest import checked_json, file_digest, parse_checked
 from roadscan.store.holding.beside import beside, put_folder
 from roadscan.store.manifest import read_recorded
 
@@ -43,7 +42,7 @@ def entry(material: Material) -> Document:
     """Return `survey.json`, from which a page finds everything."""
     context = material.context
     extent_m = material.extent_m
-    told: dict[str, Any] = {
+    members: dict[str, Any] = {
         "layout": LAYOUT, "software": SOFTWARE, "id": context.survey_id, "title": context.title or context.survey_id,
         "crs": _crs(context.map), "origin_m": _origin(material), "extent_m": extent_m,
         "height_extent_m": _heights(material), "lon_lat": _longitude_latitude(context.map, extent_m),
@@ -52,12 +51,12 @@ def entry(material: Material) -> Document:
         "report": REPORT_PAGE if _report(material) is not None else None,
     }  # fmt: skip
     for part in site_parts():
-        told |= part.members(material)
+        members |= part.members(material)
     if extent_m is None:
-        told["extent_m"] = box = _box_of(told["layers"])
-        told["lon_lat"] = _longitude_latitude(context.map, box)
-        told["degrees"] = degrees_on_map(context.map, box)
-    return json_document(ENTRY, told)
+        members["extent_m"] = box = _box_of(members["layers"])
+        members["lon_lat"] = _longitude_latitude(context.map, box)
+        members["degrees"] = degrees_on_map(context.map, box)
+    return json_document(ENTRY, members)
 
 
 def site_documents(material: Material) -> Iterator[Document]:
@@ -121,8 +120,8 @@ def publish(material: Material, out: Path, report: Callable[[int, int], None] = 
                     report(done, len(documents))
             left_out = (*site_layers(material)[1], *_lost_report(material))
         report(len(documents), len(documents))
-        told = {"layout": LAYOUT, "keys": writer.keys, "digests": writer.digests}
-        (scratch / KEYS).write_bytes(checked_json(told))
+        listing = {"layout": LAYOUT, "keys": writer.keys, "digests": writer.digests}
+        (scratch / KEYS).write_bytes(checked_json(listing))
         put_folder(scratch, out)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
@@ -138,8 +137,8 @@ def known_files(out: Path) -> tuple[dict[str, _Known], list[str]]:
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return {}, []
     try:
-        told = parse_checked((out / KEYS).read_bytes())
-        keys, digests = dict(told["keys"]), told.get("digests")
+        listing = parse_checked((out / KEYS).read_bytes())
+        keys, digests = dict(listing["keys"]), listing.get("digests")
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(
             f"{out} is there already and holds no site, or one whose {KEYS} is damaged ({error})",
@@ -264,8 +263,8 @@ def _box_of(layers: Sequence[Mapping[str, Any]]) -> Box | None:
 
 
 def _heights(material: Material) -> list[float] | None:
-    held = material.summaries.values()
-    return [min(s.height_min_m for s in held), max(s.height_max_m for s in held)] if held else None
+    summaries = material.summaries.values()
+    return [min(s.height_min_m for s in summaries), max(s.height_max_m for s in summaries)] if summaries else None
 
 
 def _longitude_latitude(frame: MapFrame, extent_m: Box | None) -> list[float] | None:

@@ -67,12 +67,12 @@ def picture_url(material: Material, held: PlacedPictures, number: int) -> str:
 @functools.lru_cache(maxsize=2)
 def picture_urls(material: Material) -> Mapping[tuple[str, str, str], str]:
     """Return the path of each picture in the site, by run, camera and file."""
-    held = placed_pictures(material)
-    logs = () if held is None else (held.logs[number] for number in held.log.tolist())
+    placed = placed_pictures(material)
+    logs = () if placed is None else (placed.logs[number] for number in placed.log.tolist())
     return {
-        (log.run, log.sensor, held.files[k]): picture_url(material, held, k)
+        (log.run, log.sensor, placed.files[k]): picture_url(material, placed, k)
         for k, log in enumerate(logs)
-        if held is not None
+        if placed is not None
     }
 
 

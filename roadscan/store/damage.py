@@ -25,9 +25,9 @@ _ANSWERS: Final = "see to the network and the store, and run again: what is ther
 
 @contextmanager
 def damage_named(arrived: str, file: str, change: str, record: str | None = None) -> Iterator[None]:
-    """Raise :func:`unread` for whatever a reader of Parquet raises; roadscan's own errors pass.
+    """Raise :func:`unread` for whatever a reader of Parquet raises; roadscan's errors pass.
 
-    arrived : what cannot be done, in words; the reader's own reason is added.
+    arrived : what cannot be done, in words; the reader's reason is added.
     file, record : where.
     change : what to do about damage.
     """

@@ -1,8 +1,10 @@
-"""Digests of files and of their bytes."""
+"""Digests of files and of their bytes, and small JSON files that bear one: damage is detected."""
 
 from __future__ import annotations
 
 import hashlib
+import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -53,3 +55,29 @@ def _hashed(stream: Any, state: Any) -> Any:
     while count := stream.readinto(buffer):
         state.update(view[:count])
     return state
+
+
+_SEAL: Final = b',\n "checksum": "%b"'
+_END: Final = b"\n}"
+
+
+def checked_json(values: Mapping[str, Any]) -> bytes:
+    """Return a non-empty object as JSON with its checksum."""
+    return _sealed(json.dumps(values, indent=1, sort_keys=True).encode())
+
+
+def parse_checked(content: bytes) -> dict[str, Any]:
+    """Return the object without its checksum (files of older versions have none); raise ValueError for damage."""
+    mark, _, _ = _SEAL.partition(b"%b")
+    start = content.rfind(mark)
+    text = content if start < 0 else content[:start] + _END
+    if start >= 0 and content != _sealed(text):
+        raise ValueError("its checksum differs")
+    values = json.loads(text)
+    if not isinstance(values, dict):
+        raise ValueError("it holds no object")
+    return values
+
+
+def _sealed(text: bytes) -> bytes:
+    return text.removesuffix(_END) + _SEAL % bytes_digest(text).encode() + _END

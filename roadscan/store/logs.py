@@ -11,9 +11,8 @@ from weakref import WeakValueDictionary
 
 from roadscan.core.errors import DamagedError, StoreError
 from roadscan.core.witness import Finding
-from roadscan.store.checked_json import checked_json, parse_checked
 from roadscan.store.codecs.group_spans import GroupRows, GroupSpans
-from roadscan.store.digest import bytes_digest
+from roadscan.store.digest import bytes_digest, checked_json, parse_checked
 from roadscan.store.store import Store
 
 _FOLDER: Final = "manifest/logs"
@@ -37,9 +36,9 @@ class DataFile:
     digest: str
     """BLAKE3-128 of its bytes with the prefix ``blake3:``; without a prefix, BLAKE2b-128 (older versions)."""
     group_rows: Sequence[int]
-    """Rows of each row group, held as :class:`GroupRows`."""
+    """Rows of each row group, stored as :class:`GroupRows`."""
     group_spans: Sequence[tuple[int, int]]
-    """First and last epoch (GPS ns) of each row group, held as :class:`GroupSpans`; empty for tables without epochs."""
+    """First and last epoch (GPS ns) of each row group (:class:`GroupSpans`); empty for tables without epochs."""
 
     def __post_init__(self) -> None:
         for name, kind in (("group_rows", GroupRows), ("group_spans", GroupSpans)):
@@ -197,8 +196,8 @@ def data_file(raw: Mapping[str, Any]) -> DataFile:
 def parse_log_record(content: bytes, key: str, path: str) -> LogRecord:
     """Return the record of the log `key`, from the content of the file `path`."""
     known = (path, bytes_digest(content))
-    if (held := _HELD.get(known)) is not None:
-        return held
+    if (parsed := _HELD.get(known)) is not None:
+        return parsed
     try:
         raw = parse_checked(content)
         raw["tables"] = {name: tuple(map(data_file, files)) for name, files in raw["tables"].items()}

@@ -14,8 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from roadscan.core.errors import DamagedError, StoreError
-from roadscan.store.checked_json import checked_json, parse_checked
-from roadscan.store.digest import bytes_hold
+from roadscan.store.digest import bytes_hold, checked_json, parse_checked
 from roadscan.store.records import RECORDS, OutputRecord, Packed, Row, latest, rows_of, sound_rows, table_of, unpacked
 from roadscan.store.store import MADE_AGAIN, Store
 
@@ -96,9 +95,9 @@ class Manifest:
     def beside(self, products: Collection[str], units: Collection[str]) -> list[OutputRecord]:
         """Return the records of some products for all units except these."""
         table = self.table()
-        own = pc.is_in(table.column("product"), pa.array(sorted(products), pa.string()))
+        of_products = pc.is_in(table.column("product"), pa.array(sorted(products), pa.string()))
         due = pc.is_in(table.column("unit"), pa.array(list(units), pa.string()))
-        return list(map(OutputRecord._make, rows_of(table.filter(pc.and_not(own, due)))))
+        return list(map(OutputRecord._make, rows_of(table.filter(pc.and_not(of_products, due)))))
 
     def chosen(self, product: str, units: Collection[str]) -> list[OutputRecord]:
         """Return the records of some units of a product, without those that have none."""
@@ -144,15 +143,15 @@ class Manifest:
 
     def reasons(self, product: str, units: Sequence[str], keys: Sequence[str]) -> dict[str, str]:
         """Return why outputs are due (:meth:`why_due`), by unit, without those that are current: of many at once."""
-        own = self.own(product)
-        at = pc.index_in(pa.array(units, pa.string()), own.column("unit"))
-        known = own.select(["key", "path", "bytes"]).take(at)
+        records = self.own(product)
+        at = pc.index_in(pa.array(units, pa.string()), records.column("unit"))
+        known = records.select(["key", "path", "bytes"]).take(at)
         same = pc.fill_null(pc.equal(known.column("key"), pa.array(keys, pa.string())), False).to_numpy()
         batches = (batch.column(0).to_pylist() for batch in known.select(["path"]).to_batches(_BATCH_ROWS))
         sizes = self._store.sizes(path or "" for paths in batches for path in paths)
-        held = np.fromiter((-1 if size is None else size for size in sizes), np.int64, known.num_rows)
+        present = np.fromiter((-1 if size is None else size for size in sizes), np.int64, known.num_rows)
         whole = pc.fill_null(pc.equal(known.column("path"), ""), False).to_numpy()
-        whole = whole | (held == pc.fill_null(known.column("bytes"), -1).to_numpy())
+        whole = whole | (present == pc.fill_null(known.column("bytes"), -1).to_numpy())
         odd = np.flatnonzero(~(same & whole))
         stored, is_same = known.column("key").take(pa.array(odd)).to_pylist(), same[odd].tolist()
         return {
@@ -217,8 +216,8 @@ class Manifest:
         """Mark the outputs of files as stale, given their full paths as in errors; unknown files are ignored."""
         if paths:
             table = self.table()
-            own = pa.array(sorted(path.removeprefix(f"{self._store.root}/") for path in paths), pa.string())
-            self.doubt(map(OutputRecord._make, rows_of(table.filter(pc.is_in(table.column("path"), own)))))
+            below_root = pa.array(sorted(path.removeprefix(f"{self._store.root}/") for path in paths), pa.string())
+            self.doubt(map(OutputRecord._make, rows_of(table.filter(pc.is_in(table.column("path"), below_root)))))
 
     def compact(self) -> None:
         """Merge all parts into one, without deleted records."""
@@ -374,8 +373,8 @@ def recorded_table(store: Store, record: OutputRecord, columns: Sequence[str] | 
 
 def recorded_rows(store: Store, records: Iterable[OutputRecord]) -> list[dict[str, Any]]:
     """Return the rows of outputs that are Parquet files, each verified as by :func:`read_recorded`."""
-    held = (record for record in records if record.path)
-    return [row for r in held for row in recorded_table(store, r).to_pylist()]
+    files = (record for record in records if record.path)
+    return [row for r in files for row in recorded_table(store, r).to_pylist()]
 
 
 def is_changing(store: Store) -> bool:
@@ -432,6 +431,6 @@ def read_failures(store: Store) -> list[dict[str, str]]:
         content = store.read_bytes(_FAILURES)
         # older versions wrote a list without a checksum
         listed = json.loads(content) if content.startswith(b"[") else parse_checked(content)["failures"]
-        return [{name: str(told[name]) for name in ("stage", "unit", "reason")} for told in listed]
+        return [{name: str(failure[name]) for name in ("stage", "unit", "reason")} for failure in listed]
     except (StoreError, ValueError, KeyError, TypeError) as error:
         return [{"stage": "the list of failures", "unit": _FAILURES, "reason": f"it is damaged ({error}); run again"}]

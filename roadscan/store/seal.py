@@ -1,4 +1,4 @@
-"""Parquet files that bear a digest of all their bytes in their own footer, and are refused where it does not hold.
+"""Parquet files that bear a digest of all their bytes in their footer, and are refused where it does not hold.
 
 The checksums of pages protect values. Nothing in the format protects the footer: one flipped bit there renames a
 column, and the file reads as another table. Any reader of Parquet opens a sealed file, and takes the seal for metadata.

@@ -14,8 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.core.errors import DamagedError, StoreError
-from roadscan.store.checked_json import checked_json, parse_checked
-from roadscan.store.digest import bytes_digest
+from roadscan.store.digest import bytes_digest, checked_json, parse_checked
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 

@@ -1,4 +1,4 @@
-"""Writes rows as sorted partitions of GPS time, in bounded memory.
+"""Writes rows as sorted partitions of GPS time, and merges sorted files of one partition, both in bounded memory.
 
 Computes columns from incoming rows, so that no log has to contain them.
 
@@ -25,7 +25,6 @@ from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.witness import Finding
 from roadscan.store.digest import file_digest
 from roadscan.store.logs import DataFile, log_folder
-from roadscan.store.merge import merged
 from roadscan.store.readings.packed_returns import PACKED, as_returns, stored_columns, write_packed_returns
 from roadscan.store.row_order import sorted_batch, sorted_rows
 from roadscan.store.schema import TableSchema, table_schema
@@ -330,3 +329,43 @@ def with_derived(schema: TableSchema, rows: pa.RecordBatch) -> pa.RecordBatch:
         at = rows.schema.get_field_index(name)
         rows = rows.set_column(at, rows.schema.field(at), pa.array(values))
     return rows
+
+
+def merged(paths: Sequence[Path], schema: TableSchema, rows: int) -> Iterator[pa.Table]:
+    """Yield the rows of files that are each sorted by the schema, in common order; equal keys keep the files' order.
+
+    Only the sort columns are in memory as a whole. Of each file, a piece of the result needs rows that follow one
+    another, so just their row groups are read.
+
+    Parameters
+    ----------
+    rows : rows of each table that is yielded; the last holds what remains.
+    """
+    files = [pq.ParquetFile(path) for path in paths]
+    keys = [pa.concat_tables([f.read(columns=[name]) for f in files]).column(0).to_numpy() for name in schema.sort]
+    order = np.lexsort(keys[::-1])
+    starts = np.cumsum([0, *(f.metadata.num_rows for f in files)])
+    for first in range(0, order.size, rows):
+        chosen = order[first : first + rows]
+        place = np.empty(chosen.size, np.int64)
+        pieces: list[pa.Table] = []
+        held = 0
+        for file, low, high in zip(files, starts[:-1], starts[1:], strict=True):
+            own = (chosen >= low) & (chosen < high)
+            if not own.any():
+                continue
+            begin, end = int(chosen[own].min() - low), int(chosen[own].max() - low) + 1
+            place[own] = chosen[own] - low - begin + held
+            pieces.append(_rows(file, begin, end))
+            held += end - begin
+        table = pa.concat_tables(pieces)
+        yield table if np.array_equal(place, np.arange(held)) else table.take(pa.array(place))
+
+
+def _rows(file: pq.ParquetFile, begin: int, end: int) -> pa.Table:
+    """Return rows [begin, end) of a file."""
+    counts = [file.metadata.row_group(k).num_rows for k in range(file.metadata.num_row_groups)]
+    starts = np.cumsum([0, *counts])
+    one = int(np.searchsorted(starts, begin, "right")) - 1
+    other = int(np.searchsorted(starts, end, "left"))
+    return file.read_row_groups(list(range(one, other))).slice(begin - int(starts[one]), end - begin)

@@ -7,7 +7,7 @@ from typing import Final
 
 from roadscan import __version__
 from roadscan.core.errors import StoreError
-from roadscan.store.checked_json import checked_json, parse_checked
+from roadscan.store.digest import checked_json, parse_checked
 
 VERSION_FILE: Final = "manifest/version.json"
 """Its path, relative to the survey's root."""

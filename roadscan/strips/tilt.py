@@ -1,6 +1,6 @@
 """Tilt of the road as a sensor saw it, against the attitude of the poses: wrong signs, mirrored profiles, late poses.
 
-Seen from the vehicle, the road tilts against every sway of it: s = c + φ, with the road's own slope c to the right and
+Seen from the vehicle, the road tilts against every sway of it: s = c + φ, with the road's slope c to the right and
 the roll φ, right side down; along the travel likewise with the pitch, nose down. Readings are placed by the recorded
 roll, so that the placed road tilts by g = s − φ. What of its sway a vehicle does not take from the road is not in c.
 So the share 1 + cov(g, φ) / var(φ) of the recorded angle that the sensor confirms is 1 on even roads, less where the
@@ -25,7 +25,7 @@ Angle = Literal["roll", "pitch"]
 _BIN_NS: Final = NS_PER_S // 10
 """A plane (or line) is fitted to the readings of this long (ns): a turn of a lidar, 1 m of a profiler at 36 km/h."""
 _SWAY_BINS: Final = 21
-"""A mean over this many bins is taken off: vehicles sway within 2 s, and what lasts longer is the road's own slope."""
+"""A mean over this many bins is taken off: vehicles sway within 2 s, and what lasts longer is the road's slope."""
 _LEAST_BINS: Final = 30
 """With fewer bins nothing is said."""
 _LEAST_READINGS: Final = 60

@@ -63,7 +63,7 @@ class Suspect:
 
 @dataclass(frozen=True)
 class Blamed:
-    """An error that explains differences, and the suspects that may have it: one of them."""
+    """An error that explains differences, and the sensors or runs of which one has it."""
 
     suspects: tuple[Suspect, ...]
     value: float

@@ -10,7 +10,7 @@ at whatever distance the vehicle drove between them.
 - **Holes** are gaps in which readings are missing (no return, not road). Splines end at them, because a
   cubic across a hole swings with the noise at its rims. Holes up to `fill_m` are filled by the straight line
   between the mean heights of the last three knots on each side. A gap between neighbouring readings is no hole,
-  but the scanner's own spacing; wider than `reach_m` it is left empty.
+  but the scanner's spacing; wider than `reach_m` it is left empty.
 - **Origins**: `measured`, a knot lies nearest to this node; `interpolated`; `filled`; or nothing.
 - The **median** is that of the nodes there are. It keeps origins.
 """

@@ -24,7 +24,7 @@ The unit of length is the root mean square offset of two rings along each axis, 
 neighbourhood is more than three times longer than wide (profiles far apart), its length is counted in larger units by
 what is beyond three.
 
-Conditioning, ``quadratic``: offsets are counted from the site and whitened by their own mean square, so stretched
+Conditioning, ``quadratic``: offsets are counted from the site and whitened by their mean square, so stretched
 meshes are as well conditioned as square ones; the normal matrix is scaled to a unit diagonal and refused where a pivot
 falls below 0.01. ``cubic``: the same for the polynomial's normal matrix, weighted by the inverse covariance.
 Another ring is taken, up to the fourth, while neighbours are too few, refused (``quadratic``), or *narrow*: spread
@@ -43,8 +43,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.surface.kernels.spline_gradients import WORK, spline_gradients
-from roadscan.surface.kernels.vertex_gradients import FITTED, LEVEL, vertex_gradients
+from roadscan.surface.kernels.spline_gradients import FITTED, LEVEL, WORK, spline_gradients, vertex_gradients
 from roadscan.surface.kernels.vertex_neighbourhoods import MOST, MOST_RINGS, neighbourhoods
 from roadscan.surface.settings import SlopeKind
 from roadscan.surface.sites import Sites

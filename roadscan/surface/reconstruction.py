@@ -140,7 +140,7 @@ def patch_of_cells(window: GridWindow, tiles: Iterable[TileCells]) -> Patch:
 
     Parameters
     ----------
-    window : in the tiles' own cells.
+    window : in the tiles' cells.
     tiles : those that share cells with it, in any order.
     """
     shape = window.rows, window.columns

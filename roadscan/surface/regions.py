@@ -9,7 +9,7 @@ A patch stands out where its roughness exceeds `factor` times that and `least_m`
 (narrow cracks) or after it (potholes in noisy ranges). Patches that touch, or lie within `join_m`, are one region; its
 box along and across the road, padded, is its outline.
 
-Patches and sections are counted from multiples of their own length along the stretch.
+Patches and sections are counted from multiples of their length along the stretch.
 """
 
 from __future__ import annotations

@@ -74,7 +74,7 @@ class SurfaceConfig(SurveySection):
 
     method: Literal["cells", "points"]
     """`cells`: the robust heights of the tiles' cells are the grid (profilers: several readings a cell); `points`: a
-    smooth surface through every reading, asked at the cells of a grid of its own (sparse sensors, such as a SICK)."""
+    smooth surface through every reading, asked at the cells of a separate grid (sparse sensors, such as a SICK)."""
     sigma_m: float = Field(gt=0.0, le=1.0)
     """1 σ of the noise of one cell's height (m). It decides what is a crack and what is noise: 0.0005 for a
     triangulation profiler, 0.006 for a SICK LMS; more where cells are finer than the readings are apart."""
@@ -84,7 +84,7 @@ class SurfaceConfig(SurveySection):
     """Its weights and thresholds; `sigma_m` is stated above."""
     cell_m: tuple[float, float] | None = None
     """`points`: edges of the grid's cells (m), east and north, such as [0.01, 0.03]; left out, `tiles.cell_m` both
-    ways. The tiles' own cells are the grid of `cells`."""
+    ways. The tiles' cells are the grid of `cells`."""
     max_gap_m: float = Field(default=0.3, gt=0.0, le=10.0)
     """`points`: widest hole that is bridged (m), at most half a tile's edge: no surface is made where a disc of this
     diameter holds no reading."""

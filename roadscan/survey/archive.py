@@ -22,8 +22,7 @@ from roadscan.core.errors import DamagedError, RunError, StoreError
 from roadscan.ingest.planned_logs import logs_of
 from roadscan.ingest.sources import files_of, listed_name
 from roadscan.run.session import Session
-from roadscan.store.checked_json import checked_json, parse_checked
-from roadscan.store.digest import file_digest, stream_digest
+from roadscan.store.digest import checked_json, file_digest, parse_checked, stream_digest
 from roadscan.store.logs import has_log
 from roadscan.store.store import opened_url
 from roadscan.survey.forgotten import forgotten_pictures
@@ -251,7 +250,7 @@ def _listed(kept: Archive) -> dict[str, dict[str, Any]]:
 
 
 def archive_place(name: str) -> str:
-    """Return where a file lies in an archive: files outside of the survey's folder are told apart by their paths."""
+    """Return where a file lies in an archive: files outside of the survey's folder are distinguished by their paths."""
     path = PurePosixPath(name)
     if not path.is_absolute() and ".." not in path.parts:
         return name

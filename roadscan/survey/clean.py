@@ -109,8 +109,8 @@ def _found(session: Session, records: Collection[LogRecord], unused: Collection[
     for record in records:
         if record.key in unused:
             yield from ((UNUSED, path) for path in (record_path(record.key), copy_path(record.key)))
-            yield from ((UNUSED, one.path) for own in record.tables.values() for one in own)
-    needed |= {one.path for record in records for own in record.tables.values() for one in own}
+            yield from ((UNUSED, one.path) for files in record.tables.values() for one in files)
+    needed |= {one.path for record in records for files in record.tables.values() for one in files}
     for path in store.files("tables"):
         if (key := log_of(path)) and path not in needed and key not in keys and not path.startswith(_FOOTPRINTS):
             yield UNRECORDED, path

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Final
 
 from roadscan.core.errors import DamagedError
-from roadscan.store.checked_json import checked_json, parse_checked
+from roadscan.store.digest import checked_json, parse_checked
 from roadscan.store.store import Store
 
 FORGOTTEN: Final = "manifest/forgotten.json"

@@ -102,8 +102,8 @@ def _rows(plan: RunPlan) -> list[_Row]:
     rows: list[_Row] = []
     top = _TOP
     for one in plan.stages:
-        title, *told = (textwrap.wrap(text, _LETTERS[0]) for text in _told(one))
-        lines = [*title, *(line for text in told for line in text)]
+        title, *details = (textwrap.wrap(text, _LETTERS[0]) for text in _told(one))
+        lines = [*title, *(line for text in details for line in text)]
         written = textwrap.wrap(", ".join(one.written), _LETTERS[1], break_on_hyphens=False)
         rows.append(_Row(one, lines, written, top, len(title)))
         top += max(rows[-1].height, rows[-1].written_height) + _GAP
@@ -117,8 +117,8 @@ def _told(one: PlannedStage) -> Iterator[str]:
         return
     counts = ((one.current, "current"), (one.due, "due"), (one.unknown, "unknown"))
     known = [f"{count:,} {word}" for count, word in counts if count]
-    told = one.reasons
-    yield f"{one.units}: {', '.join(known) or ('none' if one.due == 0 else 'not known yet')}{told and f' ({told})'}"
+    why = one.reasons
+    yield f"{one.units}: {', '.join(known) or ('none' if one.due == 0 else 'not known yet')}{why and f' ({why})'}"
     costs = [] if not one.tasks else [counted(one.tasks, "task")]
     costs += [f"{size_in_words(one.raw_bytes)} read"] if one.raw_bytes else []
     costs += [f"{size_in_words(one.worker_memory_bytes)} a worker"] if one.worker_memory_bytes else []

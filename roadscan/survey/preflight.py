@@ -655,7 +655,7 @@ def _room(asked: Asked) -> Iterator[str]:
     root = Path(asked.store.root)
     needed = 0
     for log in asked.due:
-        with contextlib.suppress(OSError):  # a log that cannot be opened is told by itself
+        with contextlib.suppress(OSError):  # a log that cannot be opened is reported separately
             needed += log.path.stat().st_size
     disk = shutil.disk_usage(next(folder for folder in (root, *root.parents) if folder.exists()))
     if disk.total and disk.free < needed:

@@ -17,12 +17,11 @@ from roadscan.ingest.planned_logs import PlannedLog, plan_logs
 from roadscan.ingest.sources import is_unchanged
 from roadscan.navigation.tasks.navigate import keep_trajectory, plan_trajectories
 from roadscan.store.logs import NAVIGATION, DataFile, LogRecord, read_log_records, table_of, write_log_record
-from roadscan.store.repair_records import repair_records
 from roadscan.store.salvage import Lost, read_lost, salvaged, write_lost
 from roadscan.store.schema import table_schema
 from roadscan.store.stamp import stamp_of
 from roadscan.store.store import Store
-from roadscan.store.verified import note_verified
+from roadscan.store.verified import note_verified, repair_records
 from roadscan.survey.status import find_damage
 
 
@@ -78,7 +77,7 @@ def accept_losses(store: Store) -> None:
 def _broken(records: Iterable[LogRecord], faults: Mapping[str, str], lost: Sequence[Lost]) -> list[_Broken]:
     found: list[_Broken] = []
     for record in records:
-        files = {f.path: f for own in record.tables.values() for f in own if f.path in faults}
+        files = {f.path: f for files_of_table in record.tables.values() for f in files_of_table if f.path in faults}
         files |= {one.file.path: one.file for one in lost if one.log == record.key}
         if files:
             found.append(_Broken(record, files, frozenset(files.keys() & faults.keys())))
@@ -159,10 +158,10 @@ def _read_again(task: IngestTask, broken: _Broken) -> list[str]:
     with store.scratch() as folder:
         writer, header = read_log(task, folder)
         fresh = writer.files(record.run, record.sensor, record.key)
-        local = {file.path: path for own in fresh.values() for path, file in own.items()}
-        new = {file.path: file for own in fresh.values() for file in own.values()}
+        local = {file.path: path for of_table in fresh.values() for path, file in of_table.items()}
+        new = {file.path: file for of_table in fresh.values() for file in of_table.values()}
         kept = {path: _kept_aside(store, path) for path in broken.files}
-        before = {f.path for own in record.tables.values() for f in own} | broken.files.keys()
+        before = {f.path for of_table in record.tables.values() for f in of_table} | broken.files.keys()
         if new.keys() == before:
             for path in broken.files:
                 store.publish(local[path], path, lasting=True)
@@ -181,13 +180,13 @@ def _with_files(
     record: LogRecord, tables: Iterable[str], files: Mapping[str, DataFile]
 ) -> dict[str, tuple[DataFile, ...]]:
     """Return the files of a record by table, with others that replace, or are added to, those that it names."""
-    known = {f.path: f for own in record.tables.values() for f in own} | dict(files)
+    known = {f.path: f for of_table in record.tables.values() for f in of_table} | dict(files)
     of = {path: table_schema(table_of(path)).rows_of for path in known}
     return {t: tuple(known[path] for path in sorted(known) if of[path] == t) for t in sorted({*tables, *record.tables})}
 
 
 def _rows(tables: Mapping[str, Sequence[DataFile]]) -> int:
-    return sum(file.rows for table, own in tables.items() if table != "rejects" for file in own)
+    return sum(file.rows for table, of_table in tables.items() if table != "rejects" for file in of_table)
 
 
 def _mended(path: str, same: bool, aside: str) -> str:
@@ -207,7 +206,7 @@ def _keep_sound(store: Store, broken: _Broken, why: str, done: Repair) -> list[s
     """Keep the sound part of a log's damaged files; the rest is lost, and listed."""
     known = {one.file.path: one for one in done.lost}
     lines: list[str] = []
-    files = {f.path: f for own in broken.record.tables.values() for f in own}
+    files = {f.path: f for of_table in broken.record.tables.values() for f in of_table}
     for path, whole in broken.files.items():
         if path not in broken.damaged:  # reported before, and its log is still gone
             continue
@@ -231,8 +230,10 @@ def _keep_sound(store: Store, broken: _Broken, why: str, done: Repair) -> list[s
             lines.append(f"{now}: {why}; the next run makes anew what they touch, without them")
         else:
             lines.append(f"{path}: mended, only what stands beside its rows was damaged{_told_aside(aside)}")
-    tables = {t: tuple(files[f.path] for f in own if f.path in files) for t, own in broken.record.tables.items()}
-    tables = {table: own for table, own in tables.items() if own}
+    tables = {
+        t: tuple(files[f.path] for f in of_table if f.path in files) for t, of_table in broken.record.tables.items()
+    }
+    tables = {table: of_table for table, of_table in tables.items() if of_table}
     if tables != broken.record.tables:
         write_lost(store, done.lost)  # first: missing rows are reported
         write_log_record(store, replace(broken.record, tables=tables, rows=_rows(tables)))
@@ -244,8 +245,8 @@ def _mend_trajectories(survey: Survey, store: Store, broken: Sequence[_Broken], 
     if not broken:
         return
     keys = [log.key for log in plan_logs(survey, store)[0]]
-    held = [record for record in read_log_records(store, damaged=[]) if record.key in keys]
-    planned = {one.key: one for one in plan_trajectories(survey, store, held)}
+    records = [record for record in read_log_records(store, damaged=[]) if record.key in keys]
+    planned = {one.key: one for one in plan_trajectories(survey, store, records)}
     for one in broken:
         if one.record.key not in planned:
             done.faults += [f"{path}: it is damaged; the next run computes this trajectory anew" for path in one.files]

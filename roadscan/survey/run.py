@@ -21,9 +21,8 @@ from roadscan.run.told import told_run, told_stage
 from roadscan.store.holding.look import look_again
 from roadscan.store.logs import read_log_records
 from roadscan.store.manifest import begin_changes, end_changes, write_failures
-from roadscan.store.repair_records import repair_records
 from roadscan.store.small_tables import digests_fault
-from roadscan.store.verified import note_written, recorded_files
+from roadscan.store.verified import note_written, recorded_files, repair_records
 from roadscan.store.written_by import VERSION_FILE, version_content
 from roadscan.surface.tasks.surface_colours import check_cameras
 from roadscan.survey.status import survey_status

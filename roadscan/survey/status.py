@@ -26,11 +26,10 @@ from roadscan.store.damage import UNREADABLE
 from roadscan.store.history import history_faults
 from roadscan.store.logs import LogRecord, copy_path, has_log, read_log_records, record_path
 from roadscan.store.manifest import Manifest, OutputRecord, read_failures
-from roadscan.store.repair_records import fault_of
 from roadscan.store.salvage import Lost, read_lost
 from roadscan.store.stamp import Stamp, stamp_of
 from roadscan.store.store import Store
-from roadscan.store.verified import held_faults, note_verified
+from roadscan.store.verified import fault_of, held_faults, note_verified
 from roadscan.store.written_by import VERSION_FILE
 from roadscan.survey.forgotten import forgotten_pictures
 from roadscan.survey.preflight import preflight

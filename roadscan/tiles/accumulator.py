@@ -18,11 +18,10 @@ from roadscan.tiles.cells import TileCells, TileEvidence
 from roadscan.tiles.kernels import cell_statistics as finishing
 from roadscan.tiles.kernels import pool as kernels
 from roadscan.tiles.kernels.accumulate import PIECE, CountingWork, Heights, accumulate_cells, work_arrays
-from roadscan.tiles.kernels.active_tiles import ActiveTiles
 from roadscan.tiles.kernels.bucket_statistics import MOST, finish_buckets, row_arrays
 from roadscan.tiles.kernels.cell_columns import CellColumns
 from roadscan.tiles.kernels.cell_statistics import AHEAD, find_groups, finish_cells
-from roadscan.tiles.kernels.row_buckets import BLOCK, PASS, Buckets, sizes_of_rows, take_readings
+from roadscan.tiles.kernels.row_buckets import BLOCK, PASS, ActiveTiles, Buckets, sizes_of_rows, take_readings
 
 ROBUST_FLOOR_QUANTA: Final = 100.0
 """Heights within 1 mm of the median always count."""

@@ -17,11 +17,10 @@ from roadscan.georeference.kernels.timed_readings import CHUNK
 from roadscan.georeference.place import COUNTED_FATES, EIGHT_TO_SIXTEEN_BITS, Placement, mirror_profiles
 from roadscan.tiles.accumulator import Accumulator
 from roadscan.tiles.kernels.accumulate import CountingWork
-from roadscan.tiles.kernels.active_tiles import ActiveTiles, Measured
-from roadscan.tiles.kernels.bucket_readings import bucket_mirror, bucket_returns
+from roadscan.tiles.kernels.bucket_statistics import bucket_mirror, bucket_returns
 from roadscan.tiles.kernels.pool import Pool
 from roadscan.tiles.kernels.profile_counting import accumulate_profiles
-from roadscan.tiles.kernels.row_buckets import Buckets
+from roadscan.tiles.kernels.row_buckets import ActiveTiles, Buckets, Measured
 
 _EIGHT_BITS: Final = np.uint32(EIGHT_TO_SIXTEEN_BITS)
 _SIXTEEN_BITS: Final = np.uint32(1)  # Factor on intensities that have 16 bits already.

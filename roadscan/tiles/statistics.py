@@ -13,10 +13,9 @@ from roadscan.georeference.kernels.timed_readings import CHUNK
 from roadscan.tiles.accumulator import Accumulator
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.kernels.accumulate import PIECE, CountingWork, accumulate_points
-from roadscan.tiles.kernels.active_tiles import ActiveTiles
-from roadscan.tiles.kernels.bucket_readings import bucket_points
+from roadscan.tiles.kernels.bucket_statistics import bucket_points
 from roadscan.tiles.kernels.pool import Pool
-from roadscan.tiles.kernels.row_buckets import Buckets
+from roadscan.tiles.kernels.row_buckets import ActiveTiles, Buckets
 
 _SAMPLE: Final = 1 << 16
 """Number of points from which the order is determined."""

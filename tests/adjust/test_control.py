@@ -11,8 +11,8 @@ from roadscan.adjust.control.control import ControlPoint, moved_m, observations_
 from roadscan.adjust.control.control_faults import WrongPoint, datum_fault, far_in_height, swapped
 from roadscan.adjust.patches import PassReadings
 from roadscan.adjust.places import Track
-from roadscan.adjust.publish import left_after
 from roadscan.adjust.targets.settings import TargetSettings
+from roadscan.adjust.tasks.publication import left_after
 from roadscan.core.frames import rotation_from_rph
 from roadscan.poses.trajectory import Corrections
 

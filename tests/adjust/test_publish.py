@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from roadscan.adjust.observations import FIXED, Observations
-from roadscan.adjust.publish import left_after, published
+from roadscan.adjust.tasks.publication import left_after, published
 from roadscan.poses.trajectory import Corrections
 
 KNOTS = np.arange(5, dtype=np.int64) * 10**9

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.adjust.seams import moved, seam_view
+from roadscan.adjust.tasks.seams import moved, seam_view
 from roadscan.adjust.tie_settings import TieSettings
 from roadscan.poses.trajectory import Corrections
 from tests.adjust.drawn_patches import PLACE, Seen, edge_line, readings

@@ -27,7 +27,7 @@ from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.earth import Earth
-from roadscan.site.evidence import of_pictures as evidence_of_pictures
+from roadscan.site.layer import of_pictures as evidence_of_pictures
 from roadscan.site.material import Material as SiteMaterial
 from roadscan.site.parts.pictures import Pictures
 from roadscan.site.parts.vectors import site_layers

@@ -10,9 +10,8 @@ import pytest
 import shapely
 
 from roadscan.compute.edges.painted_line import painted_line, without_lines
-from roadscan.condition.kernels.intensity_means import mean_intensities
 from roadscan.condition.kernels.lane_texture import FIGURES, INTENSITY, SHARE, TEXTURE, texture_of_squares
-from roadscan.condition.kernels.sampling import MOST_CELLS, Cells, CellTable, gather
+from roadscan.condition.kernels.sampling import MOST_CELLS, Cells, CellTable, gather, mean_intensities
 from roadscan.condition.on_lane.lines import lane_lines
 from roadscan.condition.on_lane.ravelling import lane_levels, ravelled_section
 from roadscan.condition.on_lane.squares import RavelledSection, TextureSquares, texture_squares

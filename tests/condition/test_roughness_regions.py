@@ -13,8 +13,8 @@ from roadscan.condition.roughness_regions.intensity import normalised_intensity,
 from roadscan.condition.roughness_regions.points import RoadPoints, pyramid, rotated_back
 from roadscan.condition.roughness_regions.raster import closed
 from roadscan.condition.roughness_regions.regions import SectionRegions, find_regions
-from roadscan.condition.roughness_regions.settings import RoughnessRegionsConfig
 from roadscan.condition.roughness_regions.surface import fit, road_below
+from roadscan.condition.settings import RoughnessRegionsConfig
 from roadscan.core.errors import ProfileError
 from tests.condition.road_section import ALL, ORIGIN, PATCH, SLANTED, SQUARE, TRENCH, Section
 

@@ -8,7 +8,7 @@ import pyarrow as pa
 import pytest
 
 from roadscan.core.gpstime import Clock, TimeSystem
-from roadscan.ingest.reading.arrow_batches import unlisted_batches
+from roadscan.ingest.reading.column_table import unlisted_batches
 from tests.formats import test_pose_quaternions
 from tests.formats.log_reading import read_log
 from tests.formats.readings import read

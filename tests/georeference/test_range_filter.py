@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 
 from roadscan.core.settings.segmentation import RangeFilter
-from roadscan.georeference.range_filter import crossing_limits, kept_in_turns, resolution_limits
+from roadscan.georeference.range_filter import kept_in_turns, limits_of_turns
 
 REACH_M, RADIUS_M = 8.0, 6.0
 
@@ -19,6 +19,14 @@ def drive(turn: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return path, np.angle(np.exp(1j * heading)), places
 
 
+def crossing_limits(path_m: np.ndarray, heading_rad: np.ndarray) -> np.ndarray:
+    """Limits (n, 2), with path and change of heading taken over the default base around each profile."""
+    settings, turned = RangeFilter(), np.unwrap(heading_rad)
+    first = np.maximum(np.searchsorted(path_m, path_m - settings.base_m / 2, side="right") - 1, 0)
+    last = np.minimum(np.searchsorted(path_m, path_m + settings.base_m / 2, side="left"), path_m.size - 1)
+    return limits_of_turns(path_m[last] - path_m[first], turned[last] - turned[first], settings)
+
+
 def lines(heading: np.ndarray, places: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """The kept pieces of the profiles on the ground."""
     across = np.stack([np.cos(heading), -np.sin(heading)], axis=-1)
@@ -29,7 +37,7 @@ def lines(heading: np.ndarray, places: np.ndarray, left: np.ndarray, right: np.n
 def test_kept_readings_of_neighbouring_profiles_do_not_cross() -> None:
     for turn in (-1, 1):
         path, heading, places = drive(turn)
-        limits = np.minimum(crossing_limits(path, heading, RangeFilter()), REACH_M)
+        limits = np.minimum(crossing_limits(path, heading), REACH_M)
         inner, outer = (1, 0) if turn > 0 else (0, 1)
         middle = slice(240, 400)  # in the turn, away from its ends
         assert np.allclose(limits[middle, inner], RADIUS_M, rtol=0.01)
@@ -44,15 +52,6 @@ def test_kept_readings_of_neighbouring_profiles_do_not_cross() -> None:
 def test_noise_of_headings_and_standing_are_no_turns() -> None:
     path = np.concatenate([np.arange(0.0, 10.0, 0.05), np.full(200, 10.0), np.arange(10.0, 20.0, 0.05)])
     heading = np.radians(np.random.default_rng(1).normal(0.0, 0.05, path.size))
-    limits = crossing_limits(path, heading, RangeFilter())
+    limits = crossing_limits(path, heading)
     across = np.linspace(-REACH_M, REACH_M, 11) + np.zeros((path.size, 1))
     assert kept_in_turns(across, limits).all()
-
-
-def test_resolution_in_place_of_the_turn() -> None:
-    path, heading, _ = drive(1)
-    limits = resolution_limits(path, heading, np.radians(0.5), RangeFilter())
-    assert np.allclose(limits[300], 0.05 / np.sin(np.radians(0.5)))
-    assert np.isinf(limits[50]).all()
-    across = np.array([[-6.0, -5.0, 0.0, 5.0, 6.0]])
-    assert kept_in_turns(across, limits[300:301]).tolist() == [[False, True, True, True, False]]

@@ -131,7 +131,7 @@ class InDatabase(PostGis):
 
     def drop(self) -> None:
         """Drop the schema and its roles."""
-        from roadscan.inventory.homes.postgis_schema import ROLES
+        from roadscan.inventory.homes.postgis import ROLES
 
         self._do(f"DROP SCHEMA IF EXISTS {self.schema} CASCADE", [])
         for role in ROLES:

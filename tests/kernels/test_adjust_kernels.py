@@ -7,8 +7,14 @@ import pytest
 import qdldl
 import scipy
 
-from roadscan.adjust.kernels.normal_equations import add_observations
-from roadscan.adjust.kernels.selected_inverse import entries, path_lengths, selected_inverse, solved_units, variances
+from roadscan.adjust.kernels.normal_equations import (
+    add_observations,
+    entries,
+    path_lengths,
+    selected_inverse,
+    solved_units,
+    variances,
+)
 
 SIZE = 40
 

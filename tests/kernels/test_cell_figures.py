@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.tiles.kernels.cell_figures import median, totals
+from roadscan.tiles.kernels.cell_statistics import median, totals
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 1000, 1001])

@@ -19,21 +19,19 @@ from roadscan.tiles.kernels.accumulate import (
     find_cells,
     work_arrays,
 )
-from roadscan.tiles.kernels.active_tiles import ActiveTiles
 from roadscan.tiles.kernels.adjacent_cells import run_end
-from roadscan.tiles.kernels.bucket_readings import bucket_points
-from roadscan.tiles.kernels.bucket_statistics import finish_buckets, row_arrays
-from roadscan.tiles.kernels.cell_columns import CellColumns
+from roadscan.tiles.kernels.bucket_statistics import bucket_points, finish_buckets, row_arrays
+from roadscan.tiles.kernels.cell_columns import CellColumns, select_arrays, statistics_of_full
 from roadscan.tiles.kernels.cell_statistics import AHEAD, find_groups, finish_cells
 from roadscan.tiles.kernels.decimate import Cells
 from roadscan.tiles.kernels.grey_pictures import grey_intensity, shade_cells
-from roadscan.tiles.kernels.large_cells import select_arrays, statistics_of_full
 from roadscan.tiles.kernels.pool import Pool
 from roadscan.tiles.kernels.pyramid import Levels, Pixels, reduce_cells
 from roadscan.tiles.kernels.row_buckets import (
     BLOCK,
     PASS,
     TAKEN,
+    ActiveTiles,
     Buckets,
     free_row,
     put_in_own_buckets,

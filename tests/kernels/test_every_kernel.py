@@ -15,8 +15,8 @@ ROOT = Path(__file__).resolve().parents[2]
 LIBRARY = ROOT / "roadscan"
 
 THROUGH_ITS_CALLER = {
-    "tiles.kernels.bucket_readings.bucket_mirror": "tests/tiles/test_cell_path.py",
-    "tiles.kernels.bucket_readings.bucket_returns": "tests/tiles/test_cell_path.py",
+    "tiles.kernels.bucket_statistics.bucket_mirror": "tests/tiles/test_cell_path.py",
+    "tiles.kernels.bucket_statistics.bucket_returns": "tests/tiles/test_cell_path.py",
     "tiles.kernels.profile_counting.accumulate_profiles": "tests/tiles/test_cell_path.py",
     "surface.kernels.faint_cracks.confirm_strips": "tests/surface/test_faint_cracks.py",
     "georeference.kernels.flat_profiles.georeference_flat_profiles": "tests/georeference/test_place.py",
@@ -45,7 +45,7 @@ THROUGH_ITS_CALLER = {
     "surface.kernels.clough_tocher.evaluate": "tests/surface/test_detailed.py",
     "surface.kernels.spline_gradients.load": "tests/surface/test_detailed.py",
     "surface.kernels.spline_gradients.spline_gradients": "tests/surface/test_detailed.py",
-    "surface.kernels.vertex_gradients.vertex_gradients": "tests/surface/test_detailed.py",
+    "surface.kernels.spline_gradients.vertex_gradients": "tests/surface/test_detailed.py",
     "surface.kernels.vertex_neighbourhoods.neighbourhoods": "tests/surface/test_detailed.py",
 }
 """Kernels whose input takes a room to make, and the test that holds what comes out against truth from outside."""

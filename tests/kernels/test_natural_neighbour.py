@@ -8,12 +8,15 @@ import shapely
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import Delaunay
 
-from roadscan.condition.kernels.delaunay_mesh import dig, mesh_of, triangulate, walk
 from roadscan.condition.kernels.natural_neighbour import (
     STEP_M,
     circle_centres,
+    dig,
+    mesh_of,
     natural_neighbour_raster,
     slopes_of_points,
+    triangulate,
+    walk,
 )
 from roadscan.condition.natural_neighbour import insertion_order, interpolate
 

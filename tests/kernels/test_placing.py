@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from roadscan.compute.kernel_options import read_only
 from roadscan.core.crs import LOCAL_WORLD, Anchor, MapFrame
 from roadscan.core.rig import Mounting
-from roadscan.georeference.charts import charts_along
-from roadscan.georeference.georeference import georeference_of
+from roadscan.georeference.charts import charts_along, georeference_of
 from roadscan.georeference.kernels.readings import (
     CLASS_KEPT,
     CLASS_NO_POSE,

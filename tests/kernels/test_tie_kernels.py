@@ -9,8 +9,17 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from roadscan.adjust.kernels.correlation import Laid, correlate, lay_upon
-from roadscan.adjust.kernels.patch_cells import Cells, Frame, Splat, cell_numbers, fill_cells, local_axes, splat
-from roadscan.adjust.kernels.plane_moments import add_moments, leave_out_far
+from roadscan.adjust.kernels.patch_cells import (
+    Cells,
+    Frame,
+    Splat,
+    add_moments,
+    cell_numbers,
+    fill_cells,
+    leave_out_far,
+    local_axes,
+    splat,
+)
 from roadscan.adjust.kernels.visits import Bins, Limits, Meetings, Samples, Spread, Visits, feet, meetings, visits
 
 

@@ -12,8 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from roadscan.site.site import KEYS
-from roadscan.store.checked_json import parse_checked
-from roadscan.store.digest import bytes_digest
+from roadscan.store.digest import bytes_digest, parse_checked
 from roadscan.store.logs import read_log_records
 from roadscan.store.manifest import Manifest, is_changing
 from roadscan.store.store import Store

@@ -13,7 +13,7 @@ from benchmarks import picture_drive
 from roadscan.core.survey import Survey
 from roadscan.formats.cameras import video
 from roadscan.georeference.plan.plan import plan_without_readings
-from roadscan.measuring.listed import listed_pictures
+from roadscan.measuring.layer import listed_pictures
 from tests.real_data.conftest import Place
 
 ERRORS = (0.1, 0.2)

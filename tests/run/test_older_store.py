@@ -18,7 +18,7 @@ from roadscan.cli import app
 from roadscan.core.errors import StoreError
 from roadscan.ingest.reading.format import log_formats
 from roadscan.run.session import Session
-from roadscan.store.checked_json import checked_json
+from roadscan.store.digest import checked_json
 from roadscan.store.query.sql import query
 from roadscan.store.written_by import VERSION_FILE
 from roadscan.survey.status import survey_status, verify_store

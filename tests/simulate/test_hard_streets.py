@@ -10,8 +10,8 @@ import pytest
 
 from benchmarks.hard_streets import KINDS, SCANNERS, hard_street
 from benchmarks.labelled_returns import CLASSES, LabelledReturns, labelled_returns
+from roadscan.simulate.bodies import CLASS_OF_KIND, class_number
 from roadscan.simulate.lidar_model import lidar_model
-from roadscan.simulate.semantics import CLASS_OF_KIND, class_number
 from roadscan.simulate.sensors.lidar import laser_errors
 from roadscan.simulate.trajectory import PoseErrors
 

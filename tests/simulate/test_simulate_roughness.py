@@ -10,7 +10,7 @@ import pytest
 from scipy.signal import welch
 
 from roadscan.simulate import Scene
-from roadscan.simulate.roughness import STEP_M, accumulated_iri, iri_m_per_km, track_offsets_m
+from roadscan.simulate.noise import STEP_M, accumulated_iri, iri_m_per_km, track_offsets_m
 from roadscan.simulate.surface import CELL_M, Surface, mean_profile_depth_mm, texture_field
 
 

@@ -25,8 +25,8 @@ from roadscan.store.logs import (
 )
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.records import Packed, sound_rows, table_of
-from roadscan.store.repair_records import repair_records
 from roadscan.store.store import Store
+from roadscan.store.verified import repair_records
 
 
 @pytest.fixture(params=["folder", "memory"])

@@ -21,11 +21,10 @@ from roadscan.core.gpstime import NS_PER_S
 from roadscan.store import manifest as manifest_module
 from roadscan.store.logs import DataFile, LogRecord, has_log, read_log_records, retire_log, write_log_record
 from roadscan.store.manifest import Manifest, OutputRecord
-from roadscan.store.merge import merged
 from roadscan.store.query.sql import connect, query
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
-from roadscan.store.writer import LogWriter
+from roadscan.store.writer import LogWriter, merged
 from tests.store.killed import dies_at_removal
 
 START = 1_400_000_000

@@ -19,7 +19,7 @@ from docs.mistakes import FIRST_GPS_S, MISTAKES, Mistake, heard, write_scans, wr
 from roadscan.cli import app
 from roadscan.core.errors import RoadscanError
 from roadscan.core.gpstime import gps_ns_from_utc
-from roadscan.store.checked_json import checked_json, parse_checked
+from roadscan.store.digest import checked_json, parse_checked
 from tests.surveys import Simulated
 
 SOUND = Mistake("none", "")

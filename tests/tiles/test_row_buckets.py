@@ -12,8 +12,7 @@ from roadscan.core.ids import TileId
 from roadscan.georeference.cloud import TilePoints
 from roadscan.georeference.kernels.readings import CLASS_KEPT, CLASS_TOO_HIGH, FATES, KEPT, OUTSIDE, Placed
 from roadscan.tiles.accumulator import Accumulator
-from roadscan.tiles.kernels.active_tiles import ActiveTiles, Measured
-from roadscan.tiles.kernels.row_buckets import TAKEN, Buckets, Places, fill_buckets
+from roadscan.tiles.kernels.row_buckets import TAKEN, ActiveTiles, Buckets, Measured, Places, fill_buckets
 from roadscan.tiles.statistics import cells_of
 
 GRID = TileGrid(10.0, 0.5)

@@ -19,7 +19,7 @@ from roadscan.adjust.targets.shapes import Shape, SurveyedLine
 from roadscan.adjust.targets.values import ExpectedTarget, HeightFind, TargetFind, TargetReadings
 from roadscan.compute.array_types import Float64
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.poses.mounting_change import MountingChange, Seat
+from roadscan.poses.movement import MountingChange, Seat
 from roadscan.poses.trajectory import Corrections
 
 SightStatus = Literal["found", "missed", "doubled", "moved", "picked", "height", "unseen"]

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from roadscan.adjust.targets.cells import Cells
-from roadscan.adjust.targets.shapes import Disc, Shape
+from roadscan.adjust.targets.shapes import Cells, Disc, Shape
 from roadscan.compute.array_types import Float64
 
 _SURROUNDINGS = 1.4

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from roadscan.adjust.targets.cells import Cells
 from roadscan.adjust.targets.settings import TargetSettings
-from roadscan.adjust.targets.shapes import Chequered, Disc, Shape
+from roadscan.adjust.targets.shapes import Cells, Chequered, Disc, Shape
 from roadscan.compute.array_types import Bool, Float64
 
 _SECTORS = 24  # Sectors around the centre in which an outline is sought.

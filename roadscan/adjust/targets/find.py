@@ -14,13 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from roadscan.adjust.targets.candidates import Candidate, candidates
-from roadscan.adjust.targets.cells import Cells, cells_of, spacing_m
 from roadscan.adjust.targets.evidence import Evidence, evidence
 from roadscan.adjust.targets.fit import ShapeFit, first_levels, fit_radius_m, fit_shape
 from roadscan.adjust.targets.heights import height_at
 from roadscan.adjust.targets.pictures import picture_of
 from roadscan.adjust.targets.settings import TargetSettings
-from roadscan.adjust.targets.shapes import Chequered
+from roadscan.adjust.targets.shapes import Cells, Chequered, cells_of, spacing_m
 from roadscan.adjust.targets.values import ExpectedTarget, Status, TargetFind, TargetPicture, TargetReadings
 from roadscan.compute.array_types import Float64
 

@@ -16,8 +16,7 @@ import numpy as np
 
 from roadscan.adjust.kernels import target_shapes as kernels
 from roadscan.adjust.kernels.target_shapes import EAST, NORTH, SIZE, TURN, UNKNOWNS
-from roadscan.adjust.targets.cells import Cells
-from roadscan.adjust.targets.shapes import Disc, Shape
+from roadscan.adjust.targets.shapes import Cells, Disc, Shape
 from roadscan.compute.array_types import Float64
 from roadscan.compute.robust import scatter_about
 

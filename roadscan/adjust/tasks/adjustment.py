@@ -37,7 +37,6 @@ from roadscan.adjust.tasks.control_work import (
 )
 from roadscan.adjust.tasks.doubts import CONTROL, CONTROL_PLACE, CORRECTED_ELSEWHERE, target_findings
 from roadscan.adjust.tasks.edge_scores import SCORES
-from roadscan.adjust.tasks.failed_ties import failed_ties
 from roadscan.adjust.tasks.figures import (
     Held,
     Rows,
@@ -50,7 +49,6 @@ from roadscan.adjust.tasks.figures import (
 )
 from roadscan.adjust.tasks.hand_ties import HandWork, hand_file, hand_work, with_hand_ties
 from roadscan.adjust.tasks.heads import COMMON_M, exchanged, head_findings, odd_steps, seams, steps_of
-from roadscan.adjust.tasks.lidar_errors import lidar_error_findings, lidar_error_lines
 from roadscan.adjust.tasks.mountings import (
     Mounted,
     calibrated_sigma,
@@ -61,12 +59,29 @@ from roadscan.adjust.tasks.mountings import (
     publish_mountings,
 )
 from roadscan.adjust.tasks.near import Sources
-from roadscan.adjust.tasks.outcome import ADJUSTMENT, PICTURES, SOLUTION, TABLES, keep_pictures, keep_tables
+from roadscan.adjust.tasks.outcome import (
+    ADJUSTMENT,
+    PICTURES,
+    SOLUTION,
+    TABLES,
+    failed_ties,
+    keep_pictures,
+    keep_tables,
+)
 from roadscan.adjust.tasks.publication import digests_of, foreign_runs, publish
 from roadscan.adjust.tasks.seams import shown_seams
 from roadscan.adjust.tasks.solution import Evidence, Solution, priors_of, solve
 from roadscan.adjust.tasks.tie_depths import RETURNS
-from roadscan.adjust.tasks.tie_work import TIES, KnownTies, TieTask, collect_ties, load_ties, tie_tasks
+from roadscan.adjust.tasks.tie_work import (
+    TIES,
+    KnownTies,
+    TieTask,
+    collect_ties,
+    lidar_error_findings,
+    lidar_error_lines,
+    load_ties,
+    tie_tasks,
+)
 from roadscan.adjust.tasks.ties_again import Again, first_ties, settled
 from roadscan.adjust.tasks.tracks import adjusted_sources, runs_of, tracks_of
 from roadscan.adjust.tie_settings import PlaceSettings

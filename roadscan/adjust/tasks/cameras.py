@@ -52,9 +52,9 @@ PICTURE_STAMPS: Final = Witness(
     told=("findings",),
 )
 _LEAST_FOCAL: Final = 0.01
-"""A focal length is told to be wrong from this share on: 0.2 m across at 20 m."""
-_LEAST_K1: Final = 0.02  # k1 is told to be wrong from here on: the right one of `drive_left` was found up to 0.014 off.
-_LEAST_CLOCK_S: Final = 0.005  # A clock is told to be wrong from here on (s): 10 cm at 70 km/h.
+"""A focal length is reported as wrong from this share on: 0.2 m across at 20 m."""
+_LEAST_K1: Final = 0.02  # k1 is wrong from here on: the right one of `drive_left` was found up to 0.014 off.
+_LEAST_CLOCK_S: Final = 0.005  # A clock is reported as wrong from here on (s): 10 cm at 70 km/h.
 _WORDS: Final = {
     "focal_x_px": ("focal length", 1.0, "px"), "centre_x_px": ("principal point, right", 1.0, "px"),
     "centre_y_px": ("principal point, down", 1.0, "px"), "k1": ("k1", 1.0, ""), "clock_s": ("clock", 1e3, "ms"),
@@ -196,7 +196,7 @@ def camera_findings(free: FreeCameras | None) -> list[Finding]:
     """Returns findings on lenses and clocks that are not what the rig file and the stamps say."""
     if free is None:
         return []
-    # Stamps that are wrong bend what is found of the lens: that is told once they are mended.
+    # Stamps that are wrong bend what is found of the lens: that is reported once they are right.
     return [said for k in range(len(free.stated)) for said in _of_clock(free, k) or _of_lens(free, k)]
 
 

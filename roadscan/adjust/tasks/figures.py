@@ -11,7 +11,6 @@ from roadscan.adjust.control.control import Sighting, moved_m
 from roadscan.adjust.control.control_test import HEIGHT
 from roadscan.adjust.observations import KINDS
 from roadscan.adjust.places import Track
-from roadscan.adjust.publish import left_after
 from roadscan.adjust.quality import (
     DistanceClass,
     HorizontalAccuracy,
@@ -22,10 +21,11 @@ from roadscan.adjust.quality import (
     relative_accuracy,
     vertical_accuracy,
 )
+from roadscan.adjust.tasks.publication import left_after
 from roadscan.adjust.tasks.solution import Evidence, Solution
 from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.ways import way_along
-from roadscan.poses.mounting_change import MountingChange
+from roadscan.poses.movement import MountingChange
 from roadscan.poses.trajectory import Corrections
 
 Rows = list[dict[str, Any]]

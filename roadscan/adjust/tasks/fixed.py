@@ -1,4 +1,4 @@
-"""Findings and lines on runs that are held fixed (`adjust.fixed`)."""
+"""Findings and lines on runs that are fixed (`adjust.fixed`)."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ from roadscan.georeference.sources import (
     key_of_row,
     mounting_change_of,
 )
-from roadscan.poses.mounting_change import MountingChange, Seat
+from roadscan.poses.movement import MountingChange, Seat
 from roadscan.store.small_tables import read_small, small_path, write_small
 from roadscan.store.store import Store
 

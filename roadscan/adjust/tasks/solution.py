@@ -57,7 +57,7 @@ from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
 from roadscan.navigation.tasks.pose_sigma import stated_pose_sigma
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded
 from roadscan.poses.level import level_poses
-from roadscan.poses.mounting_change import NO_SEAT
+from roadscan.poses.movement import NO_SEAT
 from roadscan.poses.trajectory import Corrections
 
 _WIDENED: Final = 3
@@ -289,7 +289,7 @@ def _adjusted(
     """Returns the adjustment of ties, control and pictures, the place that stands for point 0, possible faults of
     mountings, and how pictures entered.
 
-    A mounting that is off by more than its stated σ allows would be held back by it: such a σ is taken to be as large
+    A mounting that is off by more than its stated σ allows would be drawn back by it: such a σ is taken to be as large
     as what was found, and the adjustment is made once more. Control that is off as a whole looks like lever arms of all
     sensors that are off: they are not estimated then, and the control is what is doubted. A sensor whose mounting
     nothing contradicts keeps the stated one: what would be estimated is the noise of the evidence.

@@ -3,7 +3,7 @@
 Returns of a lidar are too sparse for pictures. In a cube, all windows together know how a plane lies, each window how
 far along the plane's normal (point to plane; Chen and Medioni 1992). What a window tells is what one laser saw: how far
 its ranges are off for good is an unknown of the adjustment. The normal is that of the returns about the mean
-of their own window, so windows that lie apart do not bend it.
+of their window, so windows that lie apart do not bend it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from roadscan.adjust.kernels.plane_moments import add_moments, leave_out_far
+from roadscan.adjust.kernels.patch_cells import add_moments, leave_out_far
 from roadscan.adjust.patches import PassReadings, level_from_map
 from roadscan.adjust.places import Place
 from roadscan.adjust.tie_settings import TieSettings
@@ -93,7 +93,7 @@ class _Planes:
         cube = self.cube[old]
         away = np.einsum("ni,ni->n", near.point_m[rows] - mean[window], self.normal[cube[window]])
         spread = np.bincount(cube[window], away**2, self.thickness_m.size)
-        free = np.bincount(cube, count - 1, self.thickness_m.size) - 2.0  # of the plane's own tilt
+        free = np.bincount(cube, count - 1, self.thickness_m.size) - 2.0  # of the plane's tilt
         thickness = np.sqrt(np.maximum(spread / np.maximum(free, 1), _LEAST_VARIANCE_M2))
         return replace(
             self, cube=cube[kept], mean_m=mean[kept], count=count[kept], thickness_m=thickness,

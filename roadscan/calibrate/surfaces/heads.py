@@ -52,8 +52,8 @@ def agreement(first: Placed, second: Placed, cell_m: float = 0.01, least: int = 
     NavigationError
         where the heads have no such cell in common.
     """
-    own, other = (_cells(one.place_m, cell_m, least) for one in (first, second))
-    _, a, b = np.intersect1d(own.key, other.key, assume_unique=True, return_indices=True)
+    near, other = (_cells(one.place_m, cell_m, least) for one in (first, second))
+    _, a, b = np.intersect1d(near.key, other.key, assume_unique=True, return_indices=True)
     if a.size == 0:
         raise NavigationError(
             f"'{first.readings.sensor}' and '{second.readings.sensor}' see no place in common in "
@@ -61,8 +61,8 @@ def agreement(first: Placed, second: Placed, cell_m: float = 0.01, least: int = 
             expected=f"cells of {cell_m:g} m with {least} readings of each",
             change="take larger cells, or heads whose profiles overlap",
         )
-    away = own.height_m[a] - other.height_m[b]
-    noise = own.variance_m2[a] + other.variance_m2[b]
+    away = near.height_m[a] - other.height_m[b]
+    noise = near.variance_m2[a] + other.variance_m2[b]
     even = noise <= _EVEN * np.median(noise)
     a, away, noise = a[even], away[even], noise[even]
     mean_square = float(np.mean(away**2))

@@ -73,7 +73,7 @@ class HeightSettings(Strict):
     coherence: float = Field(default=0.4, gt=0.0, lt=1.0)
     """A direction counts where this share of the slopes' energy is common to both images; the rest is noise."""
     partners: int = Field(default=6, ge=1)
-    """Drives that each sensor's drive is held against."""
+    """Drives that each sensor's drive is compared with."""
     sigma_floor_m: float = Field(default=2e-5, gt=0.0)
     """No tie is better than this (m, 1 σ): rounding, interpolation."""
     every: int = Field(default=3, ge=1)

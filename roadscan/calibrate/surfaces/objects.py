@@ -1,7 +1,7 @@
 """Ties to a calibration object of known shape: steps that the vehicle straddles, seen by two heads or more.
 
 Each step's top is a plane at a known height above the ground the object stands on. Readings that fall on a top, well
-away from its edges, are tied to its height in the object's own axes; the object's pose is estimated with the
+away from its edges, are tied to its height in the object's axes; the object's pose is estimated with the
 mountings. Two heads that both reproduce the object agree with one another. Edges are not used: between two profiles
 nothing says where one lies.
 """

@@ -298,15 +298,15 @@ def _exposures(
     found: list[Exposure] = []
     worlds: set[str] = set()
     for run in sorted({one.run for one in pictures.values()}):
-        own = {name: one for name, one in pictures.items() if one.run == run}
-        epochs = np.array([one.epoch_gps_ns for one in own.values()], np.int64)
+        of_run = {name: one for name, one in pictures.items() if one.run == run}
+        epochs = np.array([one.epoch_gps_ns for one in of_run.values()], np.int64)
         source = trajectory_source(run, records)
         worlds.add(source.world)
         spans = [(int(epochs.min()), int(epochs.max()))]
         poses = load_trajectory(store, source, spans, survey.config.navigation.max_gap_s).poses(epochs, strict=True)
         sigma = pose_sigma(store, records, source, epochs, settings)
         level = [_world_from_ned(survey, source.world, place) for place in poses.position_world_m]
-        for k, name in enumerate(own):
+        for k, name in enumerate(of_run):
             error = Traverse(
                 run,
                 int(epochs[k]),

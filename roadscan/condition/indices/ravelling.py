@@ -3,11 +3,11 @@
 The texture of a square of 0.2 m is the root mean square of its heights within blocks of 50 mm about their planes
 (:mod:`roadscan.condition.kernels.lane_texture`), so that slopes, ruts and wide holes count nothing. It is that of the
 median block, so that cracks count little. A patch is coarser than its section by 15 %, and by five times the spread of
-its sound squares; a road of another texture is its own measure, and a dark or wet place without texture is none. Where
+its sound squares; a road of another texture measures itself, and a dark or wet place without texture is none. Where
 most of a section has lost stones, the lane over its kilometre says what is sound.
 
 Sources, as public descriptions have them; no compliance is claimed. Van Ooijen, van den Bol and Bouman, *High-speed
-measurement of ravelling on porous asphalt* (2004): missing stones told by their dimensions in the texture profile.
+measurement of ravelling on porous asphalt* (2004): missing stones known by their dimensions in the texture profile.
 Laurent, Hébert, Lefebvre and Savard, *Using 3D laser profiling sensors for the automated measurement of road surface
 conditions* (2012): ravelling as loss of aggregate, from heights of the whole lane. Here the volume lost is that below
 the level under which 85 % of a square's heights lie, less that of the sound road.

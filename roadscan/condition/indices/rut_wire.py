@@ -4,7 +4,7 @@ The wire is stretched over the cross-section from edge to edge of the lane, the 
 and right are the halves of the lane in the direction of travel. Source: the wire method as public descriptions of
 AASHTO R 48 and PP 69 have it (the texts were not at hand, no compliance is claimed).
 
-Standard deviations follow from those of the heights, of which one in three is a measurement of its own, since
+Standard deviations follow from those of the heights, of which one in three is a separate measurement, since
 neighbours share cells. That of an area holds the heights' and those of the two places that carry the wire. That of a
 width holds those of wire and height over the slope at the rut's ends, for which the depth over the width is taken (half
 of the mean slope of its sides), and the step of the heights.

@@ -10,8 +10,7 @@ import numpy as np
 
 from roadscan.compute.array_types import Float64
 from roadscan.compute.edges.painted_line import painted_line, without_lines
-from roadscan.condition.kernels.intensity_means import mean_intensities
-from roadscan.condition.kernels.sampling import CellTable
+from roadscan.condition.kernels.sampling import CellTable, mean_intensities
 from roadscan.condition.road_line import Lane, RoadLine
 
 SPACING_M: Final = 0.5

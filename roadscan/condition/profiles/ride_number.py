@@ -35,7 +35,7 @@ class RideNumber(NamedTuple):
 
 
 def ride_number_ride(x_m: npt.ArrayLike, height_m: npt.ArrayLike) -> Ride:
-    """Its car's ride on profiles; see :func:`roadscan.condition.profiles.ride.ride` for parameters and errors."""
+    """Return the ride of this index's car; parameters and errors as :func:`roadscan.condition.profiles.ride.ride`."""
     return ride(x_m, height_m, RIDE_NUMBER_CAR, squared=True)
 
 

@@ -27,8 +27,8 @@ from roadscan.compute.robust import scatter_about
 from roadscan.condition.roughness_regions.intensity import three_classes
 from roadscan.condition.roughness_regions.points import RoadPoints, pyramid, rotated_back
 from roadscan.condition.roughness_regions.raster import IntensityRaster, closed, intensity_raster
-from roadscan.condition.roughness_regions.settings import RoughnessRegionsConfig
 from roadscan.condition.roughness_regions.surface import RoadSurface, fit, road_below
+from roadscan.condition.settings import RoughnessRegionsConfig
 from roadscan.core.extras import cv2
 
 

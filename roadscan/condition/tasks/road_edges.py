@@ -23,11 +23,9 @@ from roadscan.condition.road_edges.on_road import (
     road_surfaces,
 )
 from roadscan.condition.road_edges.raster import tile_points
-from roadscan.condition.road_edges.settings import RoadEdgesConfig
-from roadscan.condition.settings import ConditionConfig
+from roadscan.condition.settings import ConditionConfig, RoadEdgesConfig
 from roadscan.condition.tasks.lines import Roads
-from roadscan.condition.tasks.tasks import PieceTask
-from roadscan.condition.tasks.tiles_beside import tiles_beside
+from roadscan.condition.tasks.tasks import PieceTask, tiles_beside
 from roadscan.core.grid import TileGrid
 from roadscan.core.ids import TileId
 from roadscan.core.survey import Survey

@@ -18,10 +18,9 @@ from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.roughness_regions.intensity import normalised_intensity
 from roadscan.condition.roughness_regions.points import RoadPoints
 from roadscan.condition.roughness_regions.regions import Region, SectionRegions, find_regions
-from roadscan.condition.roughness_regions.settings import RoughnessRegionsConfig
+from roadscan.condition.settings import RoughnessRegionsConfig
 from roadscan.condition.tasks.lines import Roads
-from roadscan.condition.tasks.tasks import PieceTask
-from roadscan.condition.tasks.tiles_beside import tiles_beside
+from roadscan.condition.tasks.tasks import PieceTask, tiles_beside
 from roadscan.core.canvas import empty_figure
 from roadscan.core.extras import can_draw
 from roadscan.core.grid import TileGrid

@@ -49,7 +49,7 @@ class OverlapEvidence(Strict):
     passes: list[int] = []
     """Passes that drove over it, in place of whole runs."""
     area: Area | None = None
-    """Only readings within it; each time the vehicle comes by is a drive of its own, so that loops of one run are told
+    """Only readings within it; each time the vehicle comes by is a separate drive, so that loops of one run are kept
     apart. Where left out, each run (or pass) is one drive, and all that overlaps counts."""
 
 
@@ -102,7 +102,7 @@ class ReferenceEvidence(Strict):
     kind: Literal["reference"]
     """"reference"."""
     sensor: str
-    """Sensor of the rig whose scan is held against it."""
+    """Sensor of the rig whose scan is compared with it."""
     path: Path
     """The reference scan (LAS, LAZ, PLY, E57), relative to the survey file."""
     format: str | None = None

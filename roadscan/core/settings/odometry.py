@@ -18,7 +18,7 @@ class OdometryConfig(Strict):
     """The IMU of the rig that says where up is, and watches the turns; the only one at hand where left out. "none": it
     is not used, and the rig stands level at the beginning."""
     range_max_m: float = Field(default=100.0, gt=1.0, le=500.0)
-    """Returns farther than this, or than the sensor's own limit, are not matched (m)."""
+    """Returns farther than this, or than the sensor's limit, are not matched (m)."""
     voxel_m: float = Field(default=0.5, gt=0.05, le=5.0)
     """Edge of the cubes of the map that sweeps are matched with (m); half of it, one return of a cube is kept. 1 m
     takes a third of the time; poses then drift two to three times as much."""

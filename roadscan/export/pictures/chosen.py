@@ -121,16 +121,16 @@ def exported_names(poses: PicturePoses) -> tuple[str, ...]:
     pictures = poses.pictures
     names, by_log, by_epoch = [], [], []
     for log, file, epoch in zip(pictures.log.tolist(), pictures.files, pictures.epochs_gps_ns.tolist(), strict=True):
-        own = pictures.logs[log]
-        folder = f"{own.folder.name}-{own.key[:_KEY_DIGITS]}"
-        names.append(_inside(f"{own.run}/{own.sensor}/{file}"))
-        by_log.append(_inside(f"{own.run}/{own.sensor}/{folder}/{file}"))
+        source = pictures.logs[log]
+        folder = f"{source.folder.name}-{source.key[:_KEY_DIGITS]}"
+        names.append(_inside(f"{source.run}/{source.sensor}/{file}"))
+        by_log.append(_inside(f"{source.run}/{source.sensor}/{folder}/{file}"))
         name = by_log[-1]
         by_epoch.append(name.with_name(f"{name.stem}_{name.suffix[1:]}_{epoch}{name.suffix}"))
     for other in (by_log, by_epoch):
         copies = [str(name.with_suffix(".jpg")).casefold() for name in names]  # as programs that fold case see them
-        held = Counter(copies)
-        names = [o if held[copy] > 1 else n for n, o, copy in zip(names, other, copies, strict=True)]
+        times = Counter(copies)
+        names = [o if times[copy] > 1 else n for n, o, copy in zip(names, other, copies, strict=True)]
     return tuple(str(name if name.suffix.lower() in JPEG else name.with_suffix(".jpg")) for name in names)
 
 

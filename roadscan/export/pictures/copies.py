@@ -109,8 +109,8 @@ def _copy(poses: PicturePoses, number: int, out: Path, settings: CopySettings, h
 
 def undistorted(picture: UInt8, lens: Lens) -> UInt8:
     """Return a picture (height, width, 3) as a pinhole of the same focal lengths and principal point sees it."""
-    own = cv2.undistort(np.ascontiguousarray(picture), matrix_of(lens), lens.parameters[4:9])
-    return np.asarray(own, np.uint8)
+    straight = cv2.undistort(np.ascontiguousarray(picture), matrix_of(lens), lens.parameters[4:9])
+    return np.asarray(straight, np.uint8)
 
 
 def _pinhole(lens: Lens) -> Lens:
@@ -234,8 +234,8 @@ def _cameras(poses: PicturePoses, pinholes: bool) -> dict[str, Any]:
     for k in range(len(poses)):
         camera, lens = poses.pictures.logs[poses.pictures.log[k]].sensor, poses.pictures.views.lens_of(k)
         width, height = lens.size_px
-        own = _pinhole(lens) if pinholes and not lens.is_around else lens
-        fx, fy, cx, cy, *distortion = own.parameters[:9].tolist()
+        model = _pinhole(lens) if pinholes and not lens.is_around else lens
+        fx, fy, cx, cy, *distortion = model.parameters[:9].tolist()
         found[camera] = {
             "model": "equirectangular" if lens.is_around else "perspective", "width_px": width, "height_px": height,
             "focal_px": [fx, fy], "principal_px": [cx, cy], "distortion": distortion,

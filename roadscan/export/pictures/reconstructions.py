@@ -239,12 +239,12 @@ def _points(poses: PicturePoses, frame: LocalFrame, file: Path | None) -> Float6
 
 
 def _offset(poses: PicturePoses, frame: LocalFrame) -> dict[str, Any]:
-    """Return where the local frame lies, and by how much the map's own axes differ from it."""
+    """Return where the local frame lies, and by how much the map's axes differ from it."""
     chart = poses.pictures.map
     level = map_from_ned(chart, frame.world, frame.origin_world_m[None])[0] @ ENU_FROM_NED
     eyes = frame.points(poses.pictures.views.eye_world_m)
     apart = frame.origin_map_m + eyes @ level.T - poses.place_m
-    told: dict[str, Any] = {
+    offset: dict[str, Any] = {
         "meaning": "local = rotation · (world − origin_world_m); about: map = origin_map_m + map_from_local · local",
         "axes": "x east, y north, z up at the origin (metres)",
         "origin_map_m": frame.origin_map_m.tolist(), "map_crs": chart.crs, "map_height": chart.height,
@@ -254,8 +254,8 @@ def _offset(poses: PicturePoses, frame: LocalFrame) -> dict[str, Any]:
     }  # fmt: skip
     origin = frame.lon_lat_height
     if origin is not None:
-        told["origin_wgs84"] = dict(zip(("longitude_deg", "latitude_deg", "height_m"), origin.tolist(), strict=True))
-    return told
+        offset["origin_wgs84"] = dict(zip(("longitude_deg", "latitude_deg", "height_m"), origin.tolist(), strict=True))
+    return offset
 
 
 def _where_pictures_are(poses: PicturePoses) -> list[str]:
@@ -315,16 +315,16 @@ def tie_points(
     views = every.pictures.views
     found = places_of(point, views.eye_world_m[picture], _rays(views, picture, pixel), weight)
     own_of = {own_names[k]: k for k in chosen}
-    own = np.array([own_of.get(one, -1) for one in names], np.int64)[picture]
+    camera = np.array([own_of.get(one, -1) for one in names], np.int64)[picture]
     met = np.asarray(np.isfinite(found.place_m).all(axis=1))
-    sound = met[point] & (own >= 0)
+    sound = met[point] & (camera >= 0)
     sound &= (np.bincount(point[sound], minlength=len(found.place_m)) > 1)[point]
-    order = np.flatnonzero(sound)[np.lexsort((own[sound], point[sound]))]
+    order = np.flatnonzero(sound)[np.lexsort((camera[sound], point[sound]))]
     held, point = np.unique(point[order], return_inverse=True)
     error = np.bincount(point, np.hypot(*after[order].T)) / np.maximum(np.bincount(point), 1)
     left = rows.num_rows - len(order)
     notes = [f"{left:,} measurements of tie points are left out: without a chosen picture, or alone"] if left else []
-    return TiePoints(frame.points(found.place_m[held]), error, point, own[order], pixel[order]), notes
+    return TiePoints(frame.points(found.place_m[held]), error, point, camera[order], pixel[order]), notes
 
 
 def _pictures(rows: pa.Table, tracks: pa.Table, names: Sequence[tuple[object, object]]) -> Int64:
@@ -356,6 +356,6 @@ def _rays(views: Views, picture: Int64, pixel: Float64) -> Float64:
     """Return unit vectors (m, 3), world frame, of pixels (m, 2) of pictures."""
     ray = np.empty((len(pixel), 3))
     for number, lens in enumerate(views.lenses):
-        own = views.lens[picture] == number
-        ray[own] = rays_of(lens, pixel[own])
+        rows = views.lens[picture] == number
+        ray[rows] = rays_of(lens, pixel[rows])
     return np.asarray(np.einsum("nji,nj->ni", views.opencv_from_world[picture], ray))

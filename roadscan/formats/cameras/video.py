@@ -6,7 +6,7 @@ A video file keeps no stamps of its own but three properties (the low-cost mobil
     first = end − duration,  frame k = first + k / fps,
 
 in the camera's clock, whose measured offset to GPS time is then applied. A cut-off or damaged file would move
-all of this without a word; so the frames are counted from the packets that are really there, and their own times in
+all of this without a word; so the frames are counted from the packets that are really there, and their times in
 the container (or an AVI's index) say which of them are missing.
 """
 

@@ -12,7 +12,7 @@ rejected; a log without any inside is refused.
 **Marks.** Points that the file marks as withheld ("should not be included in processing", LAS 1.4 R15) or as noise are
 rejected unless `options.keep_marked` says otherwise. Synthetic ones are used, and named.
 
-**Coordinates** are in the file's own CRS (WKT or GeoTIFF keys) or in the one stated; x, y, z become
+**Coordinates** are in the file's CRS (WKT or GeoTIFF keys) or in the one stated; x, y, z become
 metres. A vertical unit that nothing states is taken as the metre only beside horizontal metres.
 """
 

@@ -110,7 +110,7 @@ class CurvedRegularGrid:
 
         Parameters
         ----------
-        z_m : (rows, columns) in place of the grid's own heights in these rows.
+        z_m : (rows, columns) in place of the grid's heights in these rows.
 
         Raises
         ------

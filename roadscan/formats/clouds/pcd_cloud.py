@@ -33,8 +33,7 @@ from roadscan.formats.clouds.reference_scan import (
     stated_epoch_gps_ns,
 )
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Provisional, Reject
-from roadscan.ingest.reading.point_fields import AXES, INTENSITIES
-from roadscan.ingest.reading.records import Sieve, options_of
+from roadscan.ingest.reading.records import AXES, INTENSITIES, Sieve, options_of
 
 _PACKED: Final = ("rgb", "rgba")  # names of a field of 32 bits with blue, green and red in its lowest bytes
 _COLOURS: Final = {"red": 16, "green": 8, "blue": 0}  # bits before each colour

@@ -3,7 +3,7 @@
 ``sensors/lidar/<stamp in ns>.feather`` holds x, y, z (float16, m), intensity (0–255), laser_number and
 offset_ns (Wilson et al. 2021, section 3.1, and the dataset's user guide). Coordinates are in the
 **ego-vehicle** frame (x forward, y left, z up) and already compensated for motion to the sweep's stamp,
-so a return's own epoch is stamp + offset_ns and the epoch of its pose is the stamp. With the poses of
+so a return's epoch is stamp + offset_ns and the epoch of its pose is the stamp. With the poses of
 ``city_SE3_egovehicle.feather`` as trajectory the rig file's sensor needs neither axes nor a lever arm, and those that
 it states are refused unless `mounts_vehicle_frame` confirms them. Intensity is scaled to 16 bits: 255 becomes 65,535.
 
@@ -26,7 +26,7 @@ import pyarrow as pa
 from roadscan.core.errors import FormatError, Missing, TimeSystemError
 from roadscan.core.toml_text import toml
 from roadscan.formats.lidars.returns_batch import returns_batch
-from roadscan.ingest.reading.arrow_batches import unlisted_batches, unlisted_reason
+from roadscan.ingest.reading.column_table import unlisted_batches, unlisted_reason
 from roadscan.ingest.reading.format import NO_LEVER_ARM, Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import Sieve
 from roadscan.store.damage import UNREADABLE

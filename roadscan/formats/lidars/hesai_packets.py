@@ -51,7 +51,7 @@ Raw: TypeAlias = npt.NDArray[np.void]
 RETURNS: Final = {
     0x33: 1, 0x34: 1, 0x35: 1, 0x36: 1, 0x37: 1, 0x38: 1, 0x39: 2, 0x3A: 2, 0x3B: 2, 0x3C: 2, 0x3D: 3, 0x3E: 2,
 }  # fmt: skip
-"""Returns of a firing by the return mode's byte; each is in a block of its own."""
+"""Returns of a firing by the return mode's byte; each is in a separate block."""
 
 _FASTEST_HZ: Final = 30.0  # fastest turn that is accepted
 _SLACK_CENTIDEG: Final = 10  # tolerance of azimuth steps (0.01°)
@@ -83,7 +83,7 @@ class Model:
     centre_mm: tuple[float, float] = (0.0, 0.0)
     """Optical centre at azimuth 0: in front of the sensor's origin, and left of it."""
     design_deg: tuple[float, ...] = ()
-    """Elevations by design (°), where all channels have the head's own azimuth."""
+    """Elevations by design (°), where all channels have the head's azimuth."""
 
     def variant(self, states: npt.NDArray[np.uint8], returns: int) -> Bool:
         """Return which packets (n,), by the state in their tail, are of the second sequence or of high resolution."""
@@ -342,7 +342,7 @@ def head_of(payload: bytes, layout: Layout) -> bytes:
 
 @dataclass(frozen=True)
 class Angles:
-    """Each channel's own angles, (channels,) in rad."""
+    """Each channel's angles, (channels,) in rad."""
 
     elevation: Float64
     azimuth: Float64
@@ -404,7 +404,7 @@ def odd_steps(azimuth: npt.NDArray[np.uint16], model: Model) -> Bool:
 
 
 def posix_us(raw: Raw, year: int) -> Int64:
-    """Return the packets' date and time (n,) as microseconds since 1970-01-01 by the sensor's own clock.
+    """Return the packets' date and time (n,) as microseconds since 1970-01-01 by the sensor's clock.
 
     Parameters
     ----------
@@ -468,7 +468,7 @@ def decode(
     Parameters
     ----------
     raw : (n,) packets.
-    epochs : (n,) GPS ns of the packets' own time.
+    epochs : (n,) GPS ns of the packets' time.
     sweeps : (n, blocks) sweep of each block.
     rate : of the head (0.01°/ns).
     returns : blocks a firing.

@@ -2,10 +2,10 @@
 
 One data packet is one record: :mod:`roadscan.formats.lidars.hesai_packets` says how it is decoded, and a damaged one is
 rejected whole: one with a wrong CRC, where the sensor writes one, as well. Read are the Pandar40P, Pandar64,
-PandarXT-16, PandarXT-32, XT32M, PandarQT, QT128, Pandar128 and OT128, told by the packets themselves. Coordinates
+PandarXT-16, PandarXT-32, XT32M, PandarQT, QT128, Pandar128 and OT128, recognised by the packets themselves. Coordinates
 have axes ``flu``; `laser` is the channel less one; reflectivity is scaled to 16 bits (255 becomes 65,535); a sweep ends
 where the azimuth passes 360°. All returns of a firing are kept, and one that is written twice is kept once; a distance
-of 0, which is also what blocked azimuths have, is no return. Gaps in the packets' own numbers are counted and named.
+of 0, which is also what blocked azimuths have, is no return. Gaps in the packets' numbers are counted and named.
 
 **Angles.** Each unit has its own angle file (PandarView exports it, or PTC command 0x05): `options.angles`. A sensor
 of the XT family can be read with `options.angles = "design"`, which its units meet to some 0.1°.

@@ -77,8 +77,8 @@ class KittiOptions(Strict):
     stamp_column: str = "stamp"
     """Column of that CSV with the stamp."""
     turn: Literal["azimuth", "compensated"] = "azimuth"
-    """azimuth: sweeps are as recorded, each return gets its own epoch from its azimuth;
-    compensated: the maker has already moved all returns to the sweep's stamp. They stay in the scanner's own axes, so
+    """azimuth: sweeps are as recorded, each return gets its epoch from its azimuth;
+    compensated: the maker has already moved all returns to the sweep's stamp. They stay in the scanner's axes, so
     that its mounting applies in both cases."""
     rotation: Literal["clockwise", "counterclockwise"] = "clockwise"
     """Sense in which the head turns, seen from above."""

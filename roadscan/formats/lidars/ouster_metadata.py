@@ -1,7 +1,7 @@
 """The metadata of an Ouster sensor: the JSON that its programs save beside a capture.
 
 Two layouts are read: the flat one of firmware 1.12 to 2.x (``beam_altitude_angles``, ``data_format`` …), and that of
-firmware 2.4 and later, and of Ouster's own programs, whose sections are ``sensor_info``, ``config_params``,
+firmware 2.4 and later, and of Ouster's programs, whose sections are ``sensor_info``, ``config_params``,
 ``beam_intrinsics``, ``lidar_intrinsics``, ``imu_intrinsics``, ``lidar_data_format`` and ``imu_data_format``. Lengths
 are millimetres, angles degrees, matrices 4 × 4 by rows (Ouster sensor documentation, "Sensor metadata" and "Coordinate
 frames").

@@ -28,8 +28,16 @@ from roadscan.formats.clouds.pcd_file import (
 from roadscan.formats.clouds.reference_scan import Brightness
 from roadscan.formats.lidars.returns_batch import returns_batch
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
-from roadscan.ingest.reading.point_fields import AXES, INTENSITIES, LASERS, field_named
-from roadscan.ingest.reading.records import EpochReader, Sieve, few_rejects, options_of
+from roadscan.ingest.reading.records import (
+    AXES,
+    INTENSITIES,
+    LASERS,
+    EpochReader,
+    Sieve,
+    few_rejects,
+    field_named,
+    options_of,
+)
 
 _FARTHEST_M: Final = 10_000.0  # farther positions count as damage
 _MOST_LASERS: Final = 255  # greatest number of a laser
@@ -48,7 +56,7 @@ class PcdOptions(Strict):
     """Field with the time of each point; found by itself under the usual names: t, time, timestamp, time_stamp,
     offset_time, gps_time."""
     time_from: Literal["clock", "file_name"] = "clock"
-    """What the times count from: the origin of the log's clock, in whose unit they then are; or the file's own stamp,
+    """What the times count from: the origin of the log's clock, in whose unit they then are; or the file's stamp,
     which is its name."""
     time_unit: Unit | None = None
     """Unit of the times where they count from the file's name."""

@@ -1,6 +1,6 @@
 """Lidar returns as roadscan's own ``returns`` table in Parquet or Arrow IPC (Feather).
 
-The open way in for lidars whose own files only the vendor's library reads: whoever can call that library writes one
+The open way in for lidars whose files only the vendor's library reads: whoever can call that library writes one
 row a return from it, and this reader takes it from there.
 
 ==============================================  ===========================================================

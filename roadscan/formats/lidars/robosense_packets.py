@@ -13,7 +13,7 @@ one distance and intensity a channel, all big-endian; and DIFOP packets, also of
     ============================  =======================  ========  ======  =====================
 
 The return of channel c in a block is fired at the packet's time + the blocks' time + t(c), and the head turns on
-meanwhile. With azimuth α then, the channel's own part β of it, elevation ω and the radius r of the lens, it lies at
+meanwhile. With azimuth α then, the channel's part β of it, elevation ω and the radius r of the lens, it lies at
 
     x = d cos ω cos(α + β) + r cos α,  y = −d cos ω sin(α + β) − r sin α,  z = d sin ω + h
 
@@ -168,7 +168,7 @@ def models_of(payload: bytes) -> list[Model]:
 
 @dataclass(frozen=True)
 class Angles:
-    """Each laser's own angles, (lasers,) in rad."""
+    """Each laser's angles, (lasers,) in rad."""
 
     elevation: Float64
     azimuth: Float64
@@ -211,7 +211,7 @@ class Angles:
 
 
 def posix_us(raw: Raw, model: Model) -> Int64:
-    """Return the packets' times (n,) as microseconds since 1970 by the sensor's own clock; −1 where impossible."""
+    """Return the packets' times (n,) as microseconds since 1970 by the sensor's clock; −1 where impossible."""
     byte = raw["stamp"].astype(np.int64)
     big = 256 ** np.arange(5, -1, -1, dtype=np.int64)
     if not model.dated:

@@ -16,7 +16,7 @@ and the head turns on meanwhile at its mean rate. A return's position, in axes `
 
     x = d cos ω cos α,  y = −d cos ω sin α,  z = d sin ω + v
 
-with the azimuth α and the laser's own part of it, its elevation ω and its vertical offset v (HDL-32E: drawing
+with the azimuth α and the laser's part of it, its elevation ω and its vertical offset v (HDL-32E: drawing
 86-0106; VLP-16: manual, table 9-1; VLP-16 Hi-Res, VLP-32C and VLS-128: the maker's calibration files, as VeloView has
 them, and beams whose lenses are 41.8 mm, 42.4 mm and 58.63 mm from the axis, which they cross at v).
 
@@ -84,7 +84,7 @@ class Model:
     rises_mm: tuple[float, ...] = (0.0,)
     """Height of each beam's origin above the sensor's (mm)."""
     azimuths_deg: tuple[float, ...] = (0.0,)
-    """Each laser's own part of the azimuth (°, clockwise)."""
+    """Each laser's part of the azimuth (°, clockwise)."""
     distance_mm: float = 2.0
     """Unit of distance."""
     at_once: int = 1

@@ -2,7 +2,7 @@
 
 One data packet is one record: :mod:`roadscan.formats.lidars.velodyne_packets` says how it is decoded, and a
 damaged one is rejected whole. Position packets of 512 bytes hold the lidar's stamp and a GPRMC sentence.
-Coordinates have axes ``flu``; `laser` is the maker's own number (its place in the firing sequence);
+Coordinates have axes ``flu``; `laser` is the maker's number (its place in the firing sequence);
 reflectivity is scaled to 16 bits (255 becomes 65,535); a sweep ends where the azimuth passes 360°. In dual
 return mode both returns are kept, and one that is written twice is kept once. Angles are the maker's design values,
 or those of the unit's calibration file. Where the sensor leaves out azimuths, one packet a turn lies across the gap:
@@ -11,15 +11,15 @@ its later blocks wait for the head to turn on.
 **Azimuths.** A head turns on between a block's azimuth and a laser's firing: by rate × time, as the manuals say. ROS
 drivers count a VLP-32C's lasers as fired one by one, which doubles it. In a recording of a standing VLP-32C, walls are
 flattest with 0.6 ± 0.3 times the manual's turn (tests/formats/test_head_turn.py), and by other choices of walls and
-edges with −0.3 to 0.6 ± 0.5: the doubled one is excluded, the manual's and none are not told apart.
+edges with −0.3 to 0.6 ± 0.5: the doubled one is excluded, the manual's and none are not distinguished.
 
 **Which hour** it is the data packets do not say. It comes from a valid GPRMC in the capture, or from
-`options.hour` with the clock's date; from the capture's own clock only when `options.hour = "capture"`.
+`options.hour` with the clock's date; from the capture's clock only when `options.hour = "capture"`.
 See :mod:`roadscan.formats.lidars.velodyne_hours`.
 
-**A clock that steps.** Where the stamps step against the capture's own clock, the capture is divided, and each part is
+**A clock that steps.** Where the stamps step against the capture's clock, the capture is divided, and each part is
 compared with GPRMC and the PPS byte (2: locked): parts that cannot be put on GPS time are rejected, packet by packet,
-and named. A capture without position packets has only its own clock to compare with. Packets that stand twice count
+and named. A capture without position packets has only its clock to compare with. Packets that stand twice count
 once. See `docs/clocks.md`, "Clocks that step".
 """
 

@@ -115,7 +115,7 @@ class ImuCsv(LogFormat):
     Columns whose names carry the unit are found by themselves (``angular_rate_x_rad_per_s``,
     ``gyro_x_deg_s``, ``acc_x_g``, ``accel_x_m_per_s2``, ``delta_angle_x_rad``, ``delta_velocity_x_m_per_s``);
     a name without a unit (``gyro_x``, ``wx``, ``acc_x``) needs `rate_unit` or `force_unit`, any other name
-    `columns`. Readings stay in the sensor's own axes, which the rig file places on the vehicle. Specific
+    `columns`. Readings stay in the sensor's axes, which the rig file places on the vehicle. Specific
     force is what an accelerometer feels: +g upwards at rest. Increments (delta angle, delta velocity)
     become rates through `interval_s`.
     """

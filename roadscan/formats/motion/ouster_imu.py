@@ -55,7 +55,7 @@ class OusterImuOptions(Strict):
 class OusterImu(LogFormat):
     """IMU packets of an OS0, OS1, OS2 or OSDome in the capture that holds its lidar packets, or in one of their own.
 
-    The profile LEGACY has a sample a packet: acceleration (g) and angular rate (degrees a second), whose own stamp is
+    The profile LEGACY has a sample a packet: acceleration (g) and angular rate (degrees a second), whose stamp is
     used; ACCEL32_GYRO32_NMEA has several, in m/s² and rad/s with a stamp each. Specific force is +g upwards at rest.
     Readings are turned into the axes of the sensor, as those of its lidar packets, by `imu_to_sensor_transform`; the
     header states where the IMU lies in the sensor (`imu_in_sensor_m`). A capture with lidar packets is listed twice in

@@ -20,18 +20,18 @@ from roadscan.formats.motion.rinex import RinexHeader
 from roadscan.ingest.reading.gnss import ned_from_ecef
 
 BASE_REFUSED_M: Final = 20.0
-"""Farther than this from its own code solution, a base stands elsewhere or its position is of another datum or kind of
+"""Farther than this from its code solution, a base stands elsewhere or its position is of another datum or kind of
 height: the median of code solutions is wrong by some metres, and by ten in height under a strong ionosphere."""
 BASE_DOUBTED_M: Final = 6.0
 """Horizontal distance that is worth a look: three times the usual error of a median of code solutions (m)."""
 _UNCOVERED_SHARE: Final = 0.01
-"""Share of the rover's epochs without an observation of the base, above which it is told."""
+"""Share of the rover's epochs without an observation of the base, above which it is reported."""
 FIXED_SHARE: Final = 0.5
-"""Share of fixed epochs below which a solution is told to be weak: on open roads it is above 0.9."""
+"""Share of fixed epochs below which a solution is reported as weak: on open roads it is above 0.9."""
 _DISAGREE_SIGMAS: Final = 4.0
 """Differences of both directions beyond this many of their σ have a chance of 6e-5 each."""
 _DISAGREE_SHARE: Final = 0.01
-"""Share of such epochs above which it is told: single ones are at the ends of outages."""
+"""Share of such epochs above which it is reported: single ones are at the ends of outages."""
 _ELLIPSOID: Final = (6_378_137.0, 298.257223563)
 """Semi-major axis (m) and inverse flattening that RTKLIB has for all datums."""
 _FLATTENING_OFF: Final = 1e-4
@@ -95,7 +95,7 @@ class Track:
 
 
 def base_position_m(base: PpkBase, file: Path) -> Float64:
-    """Return the geocentric position (3,) of the base's mark in its own datum.
+    """Return the geocentric position (3,) of the base's mark in its datum.
 
     Raises
     ------
@@ -209,7 +209,7 @@ def _span(epochs: Int64) -> str:
 def base_place(
     own: Track, mark_m: Float64, base: PpkBase, header: RinexHeader, file: Path
 ) -> tuple[float, list[Finding]]:
-    """Return the distance (m) of the base from the median of its own code solutions, and whether it is doubtful.
+    """Return the distance (m) of the base from the median of its code solutions, and whether it is doubtful.
 
     Raises
     ------

@@ -72,7 +72,7 @@ def rinex_header(path: Path) -> RinexHeader:
 def observed_epochs(path: Path) -> npt.NDArray[np.int64]:
     """Return the epochs (n,) of an observation file, in the order of its lines.
 
-    They are nanoseconds since 1980-01-06 in the file's own time system (that of GPS, with few exceptions).
+    They are nanoseconds since 1980-01-06 in the file's time system (that of GPS, with few exceptions).
     """
     parts: list[npt.NDArray[np.int64]] = []
     with open_text(path) as stream:

@@ -1,4 +1,4 @@
-"""RTKLIB's programs `rnx2rtkp` and `convbin` (Debian's package rtklib): found on PATH, run in a folder of their own.
+"""RTKLIB's programs `rnx2rtkp` and `convbin` (Debian's package rtklib): found on PATH, run in a separate folder.
 
 Names of options: RTKLIB 2.4.3, options.c. The position that `rnx2rtkp` gives is that of the mark below the antenna.
 """
@@ -38,7 +38,7 @@ hundred times as many."""
 PACKING_FAULTS: Final = (EOFError, OSError, zlib.error, lzma.LZMAError)
 _LEAST_S: Final = 15.0  # a program is given this long at least, a hundred times what a short log takes
 _SYSTEM_BITS: Final = {"G": 1, "R": 4, "E": 8, "J": 16, "C": 32}  # option pos1-navsys
-_SINGLE_INTERVAL_S: Final = 30  # interval of the base's own solutions: slower than their errors change
+_SINGLE_INTERVAL_S: Final = 30  # interval of the base's solutions: slower than their errors change
 
 
 def need_program(name: str, what: str) -> Path:
@@ -139,7 +139,7 @@ class Workplace:
             return dict(zip(wanted, files, strict=True))
 
     def single(self, role: str) -> Path:
-        """Return the file of positions of a station by its own code observations, every 30 s."""
+        """Return the file of positions of a station by its code observations, every 30 s."""
         options = {"pos1-posmode": "single", "pos1-ionoopt": "brdc", "pos1-tropopt": "saas", **self._common()}
         return self._solved(f"single-{role}", options, [f"{role}*.obs"], "-ti", str(_SINGLE_INTERVAL_S))
 

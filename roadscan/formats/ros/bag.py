@@ -17,14 +17,13 @@ from typing import Any, Final, NamedTuple, Self
 from roadscan.core.errors import FormatError, nearest
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.formats.lidars.pcap import Datagram
-from roadscan.formats.ros.containers.compression import ZSTD, unpack_file, unpacked
 from roadscan.formats.ros.containers.mcap_file import MAGIC as MCAP
 from roadscan.formats.ros.containers.mcap_file import McapFile
 from roadscan.formats.ros.containers.ros1_file import OLDER as ROS1
 from roadscan.formats.ros.containers.ros1_file import Ros1File
 from roadscan.formats.ros.containers.sqlite_file import MAGIC as SQLITE
 from roadscan.formats.ros.containers.sqlite_file import SqliteFile
-from roadscan.formats.ros.containers.storage import Connection, Container, MessageSpan
+from roadscan.formats.ros.containers.storage import ZSTD, Connection, Container, MessageSpan, unpack_file, unpacked
 from roadscan.formats.ros.definitions import Decode, decoder, type_name
 from roadscan.ingest.reading.format import Reject
 
@@ -185,7 +184,7 @@ class Bag:
     def decoded(self, topic: str, decode: Decode | None = None) -> Iterator[tuple[Message, Any] | Reject]:
         """Yield each message of a topic with its content (fields as attributes, arrays of numbers as NumPy arrays).
 
-        decode : reads a message in place of the topic's own definition.
+        decode : reads a message in place of the topic's definition.
         """
         decode = decode or self.topic(topic).decoder()
         for message in self.messages(topic):
@@ -268,7 +267,7 @@ def bag_files(path: Path) -> list[Path]:
     whole = (path / METADATA).is_file()
     found = [p for p in path.iterdir() if p.is_file() and _plain(p).suffix in _SUFFIXES]
     if not whole and len({_DIGITS.sub("#", _plain(p).name) for p in found}) > 1:
-        return []  # bags of their own, in one folder
+        return []  # separate bags, in one folder
     return sorted(found, key=lambda p: [int(number) for number in _DIGITS.findall(_plain(p).stem)])
 
 

@@ -67,15 +67,6 @@ def type_name(recorded: str) -> str:
     return f"{match[1]}/msg/{match[2]}" if match else recorded
 
 
-def is_known(name: str, definition: str, language: str = "msg") -> bool:
-    """Whether messages of a type can be read."""
-    try:
-        _store(name, definition, language)
-    except FormatError:
-        return False
-    return True
-
-
 def decoder(name: str, encoding: str, definition: str, language: str = "msg") -> Decode:
     """What reads messages of a type.
 

@@ -10,8 +10,7 @@ import numpy.typing as npt
 
 from roadscan.core.strict import Strict
 from roadscan.formats.ros.bag import Bag, Topic
-from roadscan.formats.ros.blocks import blocks
-from roadscan.formats.ros.topics import Timed, TopicFormat, TopicOptions, message_clock
+from roadscan.formats.ros.topics import Timed, TopicFormat, TopicOptions, blocks, message_clock
 from roadscan.ingest.reading.format import Item, LogHeader, LogSource
 from roadscan.ingest.reading.gnss import NO_POSITION, QUALITIES, UNKNOWN_QUALITY, GnssReader, RawSolutions
 from roadscan.ingest.reading.poses import GeodeticPlacement

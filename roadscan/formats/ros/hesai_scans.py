@@ -9,8 +9,7 @@ from typing import ClassVar
 from roadscan.core.strict import Strict
 from roadscan.formats.lidars.hesai_pcap import HesaiOptions, HesaiPcap, Source
 from roadscan.formats.lidars.pcap import Datagram
-from roadscan.formats.ros.packet_messages import PacketTopic
-from roadscan.formats.ros.topics import TopicFormat
+from roadscan.formats.ros.topics import PacketTopic, TopicFormat
 from roadscan.ingest.reading.format import LogSource, Reject
 
 

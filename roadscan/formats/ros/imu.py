@@ -14,8 +14,7 @@ from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2
 from roadscan.core.strict import Strict
 from roadscan.formats.motion.imu_csv import FORCE_MAX_M_PER_S2, RATE_MAX_RAD_PER_S
 from roadscan.formats.ros.bag import Bag, Topic
-from roadscan.formats.ros.blocks import blocks
-from roadscan.formats.ros.topics import Timed, TopicFormat, TopicOptions, message_clock
+from roadscan.formats.ros.topics import Timed, TopicFormat, TopicOptions, blocks, message_clock
 from roadscan.ingest.reading.format import Item, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.poses import block_rows
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of

@@ -47,7 +47,7 @@ class RosLivox(TopicFormat):
     """A message a frame: points with x, y, z (m), reflectivity (255 becomes 65,535), line, time after the stamp.
 
     A point of 0, 0, 0 is no return. The tag (kind of the return, and the driver's opinion of noise) is not kept. The
-    stamp is the timebase, the time of the first point by the lidar's own clock: with PTP or GPS that is its time,
+    stamp is the timebase, the time of the first point by the lidar's clock: with PTP or GPS that is its time,
     without either it counts from power-on. Where the header is 5 s or more off it, it is of another clock, and counts.
     """
 

@@ -44,7 +44,7 @@ class RosNmea(TopicFormat):
     options: ClassVar[type[Strict]] = RosNmeaOptions
 
     def reads(self, bag: Bag, topic: Topic) -> bool:
-        """Return whether a topic is of sentences; strings are where one of the first is a sentence."""
+        """Return whether a topic has NMEA sentences: one of strings has, where one of its first is a sentence."""
         if not super().reads(bag, topic) or topic.type == _SENTENCES:
             return super().reads(bag, topic)
         first = itertools.islice(bag.decoded(topic.name), _LOOKED_AT)

@@ -16,12 +16,19 @@ from roadscan.core.gpstime import NS_PER_S, UNIT_NS
 from roadscan.core.strict import Strict
 from roadscan.core.witness import Finding, Witness
 from roadscan.formats.ros.bag import Bag, Topic, stamp_ns
-from roadscan.formats.ros.point_times import FIELDS, UNKNOWN_NS, Origin, PointTimes, Sample, found
-from roadscan.formats.ros.return_rows import INTENSITY_MAX, ReturnRows
+from roadscan.formats.ros.return_rows import (
+    FIELDS,
+    INTENSITY_MAX,
+    UNKNOWN_NS,
+    Origin,
+    PointTimes,
+    ReturnRows,
+    Sample,
+    found,
+)
 from roadscan.formats.ros.topics import Timed, TopicFormat, TopicOptions
 from roadscan.ingest.reading.format import Item, LogHeader, LogSource, Reject
-from roadscan.ingest.reading.point_fields import AXES, INTENSITIES, LASERS, field_named
-from roadscan.ingest.reading.records import options_of
+from roadscan.ingest.reading.records import AXES, INTENSITIES, LASERS, field_named, options_of
 
 _TYPES: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Number types of sensor_msgs/PointField by its constants."""
@@ -45,10 +52,10 @@ class RosPointsOptions(TopicOptions):
     time_unit: Literal["s", "ms", "us", "ns"] | None = None
     """Unit of that field; needed where the numbers leave it open."""
     time_from: Origin | None = None
-    """What that field counts from: the message's own stamp (`header`), or the origin of the clock (`epoch`); needed
+    """What that field counts from: the message's stamp (`header`), or the origin of the clock (`epoch`); needed
     where the numbers leave it open."""
     time_ahead_s: float = 0.0
-    """Seconds by which the points' own times are ahead of the headers' stamps, where both count from the origin of a
+    """Seconds by which the points' times are ahead of the headers' stamps, where both count from the origin of a
     clock: 18 (since 2017) where the points are on GPS time and the headers on UTC, 37 where they are on TAI."""
     untimed: Literal["stamp"] | None = None
     """For clouds without a time of each point: "stamp" gives every point that of its message. It is right where the

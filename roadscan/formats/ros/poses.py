@@ -12,8 +12,7 @@ from roadscan.core.crs import LOCAL_WORLD, crs_from_text
 from roadscan.core.frames import ENU_FROM_NED, quaternion_from_rotation
 from roadscan.core.strict import Strict
 from roadscan.formats.ros.bag import Bag, Topic
-from roadscan.formats.ros.blocks import blocks
-from roadscan.formats.ros.topics import Timed, TopicFormat, TopicOptions, message_clock
+from roadscan.formats.ros.topics import Timed, TopicFormat, TopicOptions, blocks, message_clock
 from roadscan.ingest.reading.format import Item, LogHeader, LogSource
 from roadscan.ingest.reading.poses import (
     North,

@@ -10,8 +10,7 @@ from roadscan.core.strict import Strict
 from roadscan.formats.lidars.pcap import Datagram
 from roadscan.formats.lidars.robosense_packets import DIFOP_ID
 from roadscan.formats.lidars.robosense_pcap import RobosenseOptions, RobosensePcap, Source
-from roadscan.formats.ros.packet_messages import PacketTopic
-from roadscan.formats.ros.topics import TopicFormat
+from roadscan.formats.ros.topics import PacketTopic, TopicFormat
 from roadscan.ingest.reading.format import LogSource, Reject
 
 

@@ -1,4 +1,4 @@
-"""What the formats of a bag's topics share: which topic is read, which of its stamps count, and what watches them.
+"""What the formats of a bag's topics share: topics, stamps, blocks of messages, and messages that hold packets.
 
 Compares the stamps of messages' headers with the stamps at which the recording computer received them.
 
@@ -9,6 +9,7 @@ any other seconds. So the least difference of each window shows how the two cloc
 from __future__ import annotations
 
 import functools
+import struct
 from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import nullcontext
@@ -23,7 +24,8 @@ from roadscan.core.extras import need
 from roadscan.core.gpstime import NS_PER_S, SCALES, Clock, TimeSystem, ahead_of_utc_s
 from roadscan.core.strict import Strict
 from roadscan.core.witness import Finding, Witness
-from roadscan.formats.ros.bag import METADATA, Bag, Message, Topic, bag_files, is_bag, stamp_ns
+from roadscan.formats.lidars.pcap import Datagram
+from roadscan.formats.ros.bag import METADATA, Bag, Message, Topic, bag_files, is_bag, packets, stamp_ns
 from roadscan.formats.ros.definitions import Decode
 from roadscan.formats.ros.overview import Reader, contents
 from roadscan.ingest.reading.format import Contents, Item, LogFormat, LogHeader, LogSource, Reject, log_formats
@@ -259,7 +261,7 @@ class Arrivals:
     def _offset(self, late_ns: int, unix_s: int) -> str:
         """Say what a constant difference means; '' where it is the way of a message."""
         if abs(late_ns) > _OWN_COUNT_NS or self._clock.system is TimeSystem.FREE:
-            return ""  # a counter of its own, which the stated clock explains
+            return ""  # a separate counter, which the stated clock explains
         for system, ahead_s in ahead_of_utc_s(unix_s).items():
             if abs(late_ns + ahead_s * NS_PER_S) < _SAME_SCALE_NS:
                 if self._clock.system is system:
@@ -274,3 +276,96 @@ class Arrivals:
         if late_ns > _LATE_NS:
             return f"messages were received {late_ns / NS_PER_S:.3f} s or more after the stamps of their headers"
         return ""
+
+
+_MESSAGES: Final = 8_192  # messages of a block
+
+
+def blocks(items: Iterator[Timed | Item]) -> Iterator[list[Timed] | Item]:
+    """Yield lists of messages, and between them what is not a message."""
+    pending: list[Timed] = []
+    file = ""
+    for item in items:
+        if not isinstance(item, Timed):
+            yield item
+            continue
+        if pending and (len(pending) >= _MESSAGES or item.message.file != file):
+            yield pending
+            pending = []
+        file = item.message.file
+        pending.append(item)
+    if pending:
+        yield pending
+
+
+_ROOM: Final = {
+    "velodyne_msgs/msg/VelodyneScan": (1206, False),
+    "pandar_msgs/msg/PandarScan": (1500, True),
+    "hesai_lidar/msg/PandarScan": (1500, True),
+}
+"""Bytes that each packet of a message takes, and whether the packet's length follows them."""
+_HEADER: Final = 12  # bytes before the frame's name: a number or the encapsulation, and the stamp
+_LITTLE_ENDIAN: Final = 1  # second byte of the encapsulation of CDR (OMG DDSI-RTPS 2.5, 10.5)
+
+
+class PacketTopic(TopicFormat):
+    """A format of messages that hold a lidar's packets, read by the format of its captures."""
+
+    def attributes(self, source: LogSource, bag: Bag, topic: Topic) -> dict[str, Any]:
+        """Return nothing: the format of captures states what is needed."""
+        return {}
+
+    def datagrams(self, source: LogSource) -> Iterator[Datagram | Reject]:
+        """Yield the topic's packets in their order, as :func:`roadscan.formats.ros.bag.packets` does."""
+        need("rosbags.typesys", "a ROS bag")
+        with Bag.open(source.path) as bag:
+            topic = self.topic(bag, source)
+            if topic.type not in _ROOM:
+                yield from packets(bag, topic.name)
+                return
+            number = 0
+            for message in bag.messages(topic.name):
+                if isinstance(message, Reject):
+                    yield message
+                    continue
+                found = _packets_of(message, topic, number)
+                if found is None:
+                    reason = "the message does not fit its definition"
+                    yield Reject(reason, message.number, message.offset, 1, message.file)
+                    continue
+                yield from found
+                number += len(found)
+
+
+def _packets_of(message: Message, topic: Topic, number: int) -> list[Datagram] | None:
+    """Return the packets of a message, the first of which has a number; None where its bytes are damaged."""
+    data, cdr = message.data, topic.encoding == "cdr"
+    room, sized = _ROOM[topic.type]
+    if len(data) < _HEADER + 8 or (cdr and data[1] != _LITTLE_ENDIAN):
+        return None
+    at = _HEADER + 4 + struct.unpack_from("<I", data, _HEADER)[0]
+    at += -at % 4 if cdr else 0
+    if at + 4 > len(data):
+        return None
+    count = struct.unpack_from("<I", data, at)[0]
+    at += 4
+    used = 8 + room + 4 * sized
+    step = used + (-used % 4 if cdr else 0)
+    if count and at + (count - 1) * step + used > len(data):
+        return None
+    words = (
+        np.dtype(
+            {"names": ["stamp", "size"], "formats": [("<u4", (2,)), "<u4"], "offsets": [0, 8 + room], "itemsize": used}
+        )
+        if sized
+        else np.dtype({"names": ["stamp"], "formats": [("<u4", (2,))], "itemsize": used})
+    )
+    heads = np.ndarray((count,), words, data, at, (step,))
+    stamps = heads["stamp"].astype(np.int64) @ np.array([NS_PER_S, 1])
+    times = np.where(stamps == 0, message.receive_ns, stamps).tolist()
+    sizes = np.minimum(heads["size"], room).tolist() if sized else [room] * count
+    begins = range(at + 8, at + 8 + count * step, step)
+    return [
+        Datagram(number + k, message.offset, time_ns, "", 0, bytes(data[begin : begin + size]))
+        for k, (begin, size, time_ns) in enumerate(zip(begins, sizes, times, strict=True))
+    ]

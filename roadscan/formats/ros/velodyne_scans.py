@@ -10,8 +10,7 @@ from roadscan.core.strict import Strict
 from roadscan.formats.lidars.pcap import Datagram, Wanted
 from roadscan.formats.lidars.velodyne_packets import DATA_BYTES
 from roadscan.formats.lidars.velodyne_pcap import Source, VelodyneOptions, VelodynePcap
-from roadscan.formats.ros.packet_messages import PacketTopic
-from roadscan.formats.ros.topics import TopicFormat
+from roadscan.formats.ros.topics import PacketTopic, TopicFormat
 from roadscan.ingest.reading.format import LogSource, Reject
 
 

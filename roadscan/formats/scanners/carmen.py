@@ -17,10 +17,10 @@ listed in `rejects`, as is each damaged one. Records are lines, the first is 0. 
 xz.
 
 **Scans.** θ and beam angles count counter-clockwise seen from above, beam angle 0 points ahead. Sensor axes as for
-`sick_lms.py`: z ahead, y to the right, x up, ``axes = "urf"``. Where the log's own poses place its
+`sick_lms.py`: z ahead, y to the right, x up, ``axes = "urf"``. Where the log's poses place its
 scans, it says with them how the scanner is mounted, and that holds unless the rig file states otherwise. FLASER and
 its kin do not state their angles: 180 or 181 readings begin at −90° in steps of 1°, 360 or 361 in steps of 0.5°
-(CARMEN's own rule, after the SICK LMS), 400 or 401 at −50° in steps of 0.25°. Ranges become whole numbers of a step
+(CARMEN's rule, after the SICK LMS), 400 or 401 at −50° in steps of 0.25°. Ranges become whole numbers of a step
 that loses none of the log's digits. Readings at or beyond the scanner's maximum are no returns, 0.
 
 **Trajectory.** A log with poses fills `trajectory` too, in the frame "local": x and y as stated, z 0, body forward,

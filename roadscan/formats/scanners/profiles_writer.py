@@ -96,11 +96,11 @@ def write_profiles(
     largest, rows = 0.0, max(1, _GROUP_READINGS // across.size)
     with parquet_file(target, schema) as writer:
         for first in range(0, epoch_gps_ns.size, rows):
-            own = slice(first, first + rows)
-            ranges = sensor_height_m - heights[own]
+            part = slice(first, first + rows)
+            ranges = sensor_height_m - heights[part]
             raw = _raw(ranges, geometry)
             largest = max(largest, _largest_error(ranges, raw, geometry))
-            columns = [pa.array(epoch_gps_ns[own]), _lists(raw)] + ([] if light is None else [_lists(light[own])])
+            columns = [pa.array(epoch_gps_ns[part]), _lists(raw)] + ([] if light is None else [_lists(light[part])])
             writer.write_table(pa.table(columns, schema=schema))
     missing = int(np.count_nonzero(np.isnan(heights)))
     first_epoch, last_epoch = int(epoch_gps_ns.min()), int(epoch_gps_ns.max())

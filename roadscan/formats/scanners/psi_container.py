@@ -10,7 +10,7 @@ member, and written as a zlib stream. OpenCRG, zipped OpenCRG and JPEG 2000 insi
 and zip hold checksums; raw images hold none, and a JPEG that is damaged in its coded pixels decodes to wrong pixels, as
 it does everywhere: only its header, size, scans and end are checked.
 
-**Memory.** Every size that the header claims is held against the file's true size first. A compressed image may
+**Memory.** Every size that the header claims is compared with the file's true size first. A compressed image may
 claim at most 64 MB plus 100 times the bytes it is stored in (:data:`INFLATION_FREE_BYTES`,
 :data:`INFLATION_FACTOR`); nothing is allocated for one that claims more.
 """
@@ -417,7 +417,7 @@ def _unzipped(data: bytes, size: int) -> bytes:
         if data[:2] == b"PK":
             out = _from_archive(data, size)
         else:
-            inflater = zlib.decompressobj(wbits=47)  # zlib or gzip, by the stream's own header
+            inflater = zlib.decompressobj(wbits=47)  # zlib or gzip, by the stream's header
             out = inflater.decompress(data, size + 1)
             if not inflater.eof and len(out) <= size:
                 raise ImageError("the compressed data end too early")

@@ -1,6 +1,6 @@
 """Line scanners: roadscan's own ``scans`` table as Parquet or Arrow IPC (Feather).
 
-The open way in for profilers whose own files only the vendor's library reads: whoever can call that
+The open way in for profilers whose files only the vendor's library reads: whoever can call that
 library writes one row a profile from it, and this reader takes it from there.
 
 ========================================  ==============================================================

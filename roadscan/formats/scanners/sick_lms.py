@@ -21,9 +21,9 @@ forward, first reading to the right, has the axes of the body, ``axes = "frd"``;
 
 **Turns.** The mirror turns 75 times a second, and the laser fires once a degree. A scan at 1° is half a turn, 6.67 ms.
 One at 0.5° takes two turns and one at 0.25° four, each turn beginning one step later; at 100 km/h the vehicle drives
-0.37 m from one turn to the next. So every turn becomes a row of its own, with its own epoch, and 0 (no return) where
+0.37 m from one turn to the next. So every turn becomes a separate row, with its epoch, and 0 (no return) where
 the other turns measured. That the turns of a complete scan come in the order of their angles is an assumption; partial
-scans state their angle themselves. The mirror's own variation of speed is not modelled.
+scans state their angle themselves. The mirror's variation of speed is not modelled.
 
 The values' codes for "no range" become 0. Their flag bits (fields, dazzle, reflectors) and the scans' status bytes are
 not kept; scans whose status says error or implausible are listed in `rejects`.

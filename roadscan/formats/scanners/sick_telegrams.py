@@ -4,7 +4,7 @@ A telegram, little-endian (SICK, *Telegrams for Configuring and Operating the LM
 
     0x02 · address · length n (2 bytes) · n bytes: command, data, status · CRC-16 (2 bytes)
 
-The address is 0x80 in what a scanner says (0x80 + its own address, which is 0 unless somebody set it) and 0x00
+The address is 0x80 in what a scanner says (0x80 + its address, which is 0 unless somebody set it) and 0x00
 in what a host says to it. The CRC covers all bytes before it. It is SICK's own: the remainder is shifted by one
 *bit* for each byte, and each byte goes in twice, the second time eight bits higher:
 

@@ -51,7 +51,7 @@ class Smrmsg(LogFormat):
     """Little-endian records of 10 doubles without a header.
 
     Time (s), 1 σ of the position north, east, down (m), of the velocity north, east, down (m/s), of
-    roll, pitch, heading (arc minutes; roadscan keeps degrees). Read as a log of its own it fills
+    roll, pitch, heading (arc minutes; roadscan keeps degrees). Read as a separate log it fills
     `trajectory_accuracy`. To carry its σ with the poses, name it in the SBET log instead: options =
     { accuracy = "smrmsg_mission.out" }. A file packed with gzip, bzip2 or xz is read as it is.
     """

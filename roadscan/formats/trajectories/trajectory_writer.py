@@ -94,7 +94,7 @@ def write_trajectory(
         if a column is missing or says no unit, if a value is missing, or if nothing states what the numbers are.
     """
     target = Path(path)
-    names = tuple(str(name) for name in table.keys())  # noqa: SIM118 — a DataFrame's own iteration differs by version
+    names = tuple(str(name) for name in table.keys())  # noqa: SIM118 — a DataFrame's iteration differs by version
     stated = {key: ColumnOption.parse(dict(option)) for key, option in (columns or {}).items()}
     position = ECEF if _is_geocentric(crs) else position_of(crs)
     attitude = ATTITUDE if quaternions is None else QUATERNION

@@ -14,11 +14,19 @@ from roadscan.compute.array_types import Float64
 from roadscan.core.crs import crs_from_text
 from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.formats.vectors.control import ControlFrame, ControlReader, RawControl, Role, need_role
-from roadscan.ingest.reading.columns import UNITS, ColumnOption, Found, Quantity, find_columns, fits
+from roadscan.ingest.reading.columns import (
+    UNITS,
+    ColumnOption,
+    Found,
+    Quantity,
+    degrees_of,
+    find_columns,
+    fits,
+    is_sexagesimal,
+)
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.poses import GRID_MAX_M, HEIGHT_MAX_M, HEIGHT_MIN_M
 from roadscan.ingest.reading.records import options_of
-from roadscan.ingest.reading.sexagesimal import degrees_of, is_sexagesimal
 from roadscan.ingest.reading.text_table import (
     Kind,
     TextBlock,

@@ -63,7 +63,7 @@ class ControlVectorOptions(Strict):
 class ControlVector(LogFormat):
     """A feature a point: a point geometry with z, and the attributes name, code, role and σ.
 
-    The layer's own CRS has to be the stated one (horizontally); a layer that names none is taken
+    The layer's CRS has to be the stated one (horizontally); a layer that names none is taken
     in the stated one. GeoJSON without a `crs` member is in longitude and latitude of WGS 84.
     """
 

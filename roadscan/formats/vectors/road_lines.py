@@ -130,7 +130,7 @@ class RoadLinesOptions(Strict):
     class_widths_m: dict[str, Annotated[float, Field(gt=0, le=_WIDEST_M, allow_inf_nan=False)]] = {}
     """Width of the roads of a class (m) by class, such as { S1100 = 22.0 }; stands above the table for TIGER/Line."""
     measure_from_column: str | None = None
-    """Attribute with the measure (milepost) at a line's first vertex, in the layer's own unit; for the reference lines
+    """Attribute with the measure (milepost) at a line's first vertex, in the layer's unit; for the reference lines
     of `[condition]`."""
     measure_to_column: str | None = None
     """Attribute with the measure at its last vertex."""
@@ -139,7 +139,7 @@ class RoadLinesOptions(Strict):
 class RoadLines(LogFormat):
     """A line feature a road, with its class and width.
 
-    The layer's own CRS has to be the stated one (horizontally); a layer that names none is taken in the stated one,
+    The layer's CRS has to be the stated one (horizontally); a layer that names none is taken in the stated one,
     and none need be stated for a layer that names its own. Lines are drawn to metres, so the best known change of datum
     is taken, however exact. Parts of a multi-part line become rows; heights are left out.
     """

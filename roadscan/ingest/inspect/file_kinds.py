@@ -1,6 +1,6 @@
 """Identifies files that no raw format claims, by their first bytes.
 
-roadscan's own products and settings files are read through; of other files the words are those a person would
+roadscan's products and settings files are read through; of other files the words are those a person would
 use ("a PNG picture, 640 × 480"). Nothing here trusts a size that a file claims, and nothing raises.
 """
 
@@ -118,7 +118,7 @@ class FileKind:
     faults: tuple[str, ...] = ()
     """What is wrong with it."""
     readable: bool = False
-    """True for roadscan's own products, tables and settings files that could be read."""
+    """True for roadscan's products, tables and settings files that could be read."""
     role: str = ""
     """survey, rig, scene, product, archive, or empty."""
 

@@ -239,10 +239,10 @@ def candidates(folder: Path, taken: frozenset[Path] = frozenset()) -> Iterator[P
     ----------
     taken : files that belong to a folder log further up.
     """
-    own = _taken_by_folder_log(folder) - taken
-    if own:
+    of_folder = _taken_by_folder_log(folder) - taken
+    if of_folder:
         yield folder
-    taken |= own
+    taken |= of_folder
     for entry in _entries(folder):
         if entry.name.startswith("."):
             continue
@@ -272,22 +272,22 @@ def _taken_by_folder_log(folder: Path) -> frozenset[Path]:
     same format, in one folder, with names that differ in digits only.
     """
     for log_format in formats_of(folder):
-        own = log_format.files(folder)
+        files = log_format.files(folder)
         if log_format.contents(folder) is not None:
-            return frozenset(own)
-        singly = {path: {f.name for f in formats_of(path)} for path in own[:_SAMPLED]}
+            return frozenset(files)
+        singly = {path: {f.name for f in formats_of(path)} for path in files[:_SAMPLED]}
         others = {path for path, names in singly.items() if names and log_format.name not in names}
         parts = [path for path, names in singly.items() if log_format.name in names]
         is_one = not parts or (len(parts) > 1 and len({_pattern(path) for path in parts}) == 1)
-        if is_one and len(others) < len(singly) and (parts or not _holds_logs(folder, set(own) - others)):
-            return frozenset(own) - others
+        if is_one and len(others) < len(singly) and (parts or not _holds_logs(folder, set(files) - others)):
+            return frozenset(files) - others
     return frozenset()
 
 
-def _holds_logs(folder: Path, own: Set[Path]) -> bool:
+def _holds_logs(folder: Path, files: Set[Path]) -> bool:
     """Return True if a deeper folder also claims to be a log and contains all files of this one: then it is the log."""
     below = [child for child in _entries(folder) if child.is_dir() and not child.is_symlink()]
-    return any(formats_of(child) and all(child in path.parents for path in own) for child in below)
+    return any(formats_of(child) and all(child in path.parents for path in files) for child in below)
 
 
 def _pattern(path: Path) -> tuple[Path, str]:
@@ -327,7 +327,7 @@ def _sort_in(path: Path, found: FoundFolder, logs: list[FoundLog], progress: Pro
 def _sort_in_parts(
     container: Inspection, contents: Contents, found: FoundFolder, logs: list[FoundLog], progress: Progress
 ) -> None:
-    """Sort in each part of a container as a log of its own."""
+    """Sort in each part of a container as a separate log."""
     for part in contents.parts:
         if not part.format:
             continue
@@ -445,7 +445,7 @@ def shared_time(one: LogReport, other: LogReport) -> float:
 def _common_scale(one: LogReport, other: LogReport) -> tuple[str, list[int], list[int]] | None:
     """Return the common time scale of two logs and their spans on it; None where they have none.
 
-    Seconds of the week are compared with GPS time by its own seconds of the week.
+    Seconds of the week are compared with GPS time by its seconds of the week.
     """
     spans = [_comparable(one), _comparable(other)]
     if any(span is None for span in spans):

@@ -170,8 +170,8 @@ def _extent(extent: Extent, table: TableFigures, opened: OpenedLog) -> Iterator[
 def _names_say_units(opened: OpenedLog) -> bool:
     """Return whether the names of the coordinate columns end with units, as easting_m does."""
     columns = opened.header.attributes.get("columns", {})
-    own = [columns[name] for name in ("easting", "northing", "height") if name in columns]
-    return bool(own) and all(name.rpartition("_")[2].lower() in UNITS["length"] for name in own)
+    names = [columns[name] for name in ("easting", "northing", "height") if name in columns]
+    return bool(names) and all(name.rpartition("_")[2].lower() in UNITS["length"] for name in names)
 
 
 def _readings(table: TableFigures) -> Iterator[str]:

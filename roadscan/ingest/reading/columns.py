@@ -1,4 +1,4 @@
-"""Finds named columns with units: which column of a file is which quantity, in which unit.
+"""Finds named columns with units, and reads angles in degrees, minutes and seconds.
 
 A column is found by a name that carries its unit (``latitude_deg``, ``height_m``); any other name
 has to be mapped, with its unit, in the log's options. Nothing is guessed.
@@ -12,6 +12,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
 
 from roadscan.core.errors import ConfigError, FormatError, Missing, TimeSystemError, nearest
 from roadscan.core.gpstime import UNIT_NS, Clock
@@ -344,3 +347,34 @@ def stamp_column(stated: str | None, names: tuple[str, ...], known: tuple[str, .
     """Return the column of numeric time stamps (see :func:`named_column`), with the unit at the end of its name."""
     column = named_column("the time stamps", stated, known, names, file)
     return Found(column, 1.0, unit_in_name(column, "time"))
+
+
+_ANGLE: Final = re.compile(
+    r"""(?P<before>[NSEW+-]?)\s*(?P<deg>\d{1,3})\s*[°ºd:\s-]\s*(?P<min>\d{1,2})\s*['′’m:\s-]\s*
+    (?P<sec>\d{1,2}(?:[.,]\d*)?)\s*(?:"|″|”|''|s)?\s*(?P<after>[NSEW]?)""",
+    re.VERBOSE,
+)
+_HALVES: Final = {"latitude": "NS", "longitude": "EW"}
+
+
+def is_sexagesimal(word: str) -> bool:
+    """Return True for an angle in degrees, minutes and seconds."""
+    return _ANGLE.fullmatch(word.strip()) is not None
+
+
+def degrees_of(words: Sequence[str], of: Literal["latitude", "longitude"]) -> npt.NDArray[np.float64]:
+    """Return degrees (n,), positive north and east; NaN for words that are no such angle, or of the other kind."""
+    return np.array([_degrees(word.strip(), of) for word in words], dtype=np.float64)
+
+
+def _degrees(word: str, of: Literal["latitude", "longitude"]) -> float:
+    found = _ANGLE.fullmatch(word)
+    if found is None:
+        return math.nan
+    minutes, seconds = int(found["min"]), float(found["sec"].replace(",", "."))
+    letters = [letter for letter in (found["before"], found["after"]) if letter.isalpha()]
+    if minutes >= 60 or seconds >= 60 or len(letters) > 1 or not set(letters) <= set(_HALVES[of]):
+        return math.nan
+    is_negative = found["before"] == "-" or letters in (["S"], ["W"])
+    degrees = int(found["deg"]) + minutes / 60 + seconds / 3600
+    return -degrees if is_negative else degrees

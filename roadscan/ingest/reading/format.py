@@ -414,11 +414,11 @@ class LogFormat(ABC):
         return []
 
     def contents(self, path: Path) -> Contents | None:
-        """Return all streams of a container, those of other formats too; None for a log of its own."""
+        """Return all streams of a container, those of other formats too; None for a separate log."""
         return None
 
     def shared_options(self, survey: Survey) -> dict[str, Any]:
-        """Return settings that the survey file states once for all logs of the format; a log's own go before them."""
+        """Return settings that the survey file states once for all logs of the format; a log may state others."""
         return {}
 
     @abstractmethod

@@ -1,4 +1,4 @@
-"""Shared parts of all record readers: which records are sound, why others are not, and their epochs.
+"""Shared parts of all record readers: which records are sound, their epochs, and the names of point fields.
 
 Nothing here knows a format. A :class:`Sieve` collects the faults of a block's records, an
 :class:`EpochReader` brings a log's stamps to GPS time block by block.
@@ -6,7 +6,7 @@ Nothing here knows a format. A :class:`Sieve` collects the faults of a block's r
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Self, TypeVar
@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.array_types import Bool, Float64, Int64
-from roadscan.core.errors import RoadscanError, TimeSystemError
+from roadscan.core.errors import ConfigError, RoadscanError, TimeSystemError, nearest
 from roadscan.core.gpstime import (
     EARLIEST_GPS_NS,
     LATEST_GPS_NS,
@@ -302,3 +302,31 @@ class UnorderedStamps:
         out = np.zeros(stamps.size, dtype=np.int64)
         out[sieve.kept] = self.clock.to_epoch_gps_ns(used[sieve.kept])
         return out
+
+
+AXES: Final = ("x", "y", "z")
+INTENSITIES: Final = ("intensity", "intensities", "reflectivity", "signal")
+"""Names of a field with the intensity."""
+LASERS: Final = ("ring", "channel", "line", "laser_id", "laser")
+"""Names of a field with the laser's number."""
+
+
+def field_named(
+    stated: str | None, option: str, usual: tuple[str, ...], names: Collection[str], file: Path
+) -> str | None:
+    """Return a field's name, as stated or one of the usual ones; None where there is none.
+
+    Raises
+    ------
+    ConfigError
+        where the stated one is not there.
+    """
+    if stated is None:
+        return next((name for name in usual if name in names), None)
+    if stated not in names:
+        raise ConfigError(
+            f"options.{option} = '{stated}'{nearest(stated, names)}: the points have no such field",
+            expected="one of: " + ", ".join(names),
+            file=file,
+        )
+    return stated

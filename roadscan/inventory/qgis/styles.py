@@ -233,7 +233,7 @@ def _value_map(values: Sequence[str], *, nullable: bool) -> Element:
     config = SubElement(widget, "config")
     options = SubElement(config, "Option", type="Map")
     listed = SubElement(options, "Option", type="List", name="map")
-    null = "{2839923C-8B7D-419E-B84B-CA2FE9B80EC7}"  # QGIS's own text for NULL
+    null = "{2839923C-8B7D-419E-B84B-CA2FE9B80EC7}"  # QGIS's text for NULL
     for shown, value in [("", null)] * nullable + [(value, value) for value in values]:
         entry = SubElement(listed, "Option", type="Map")
         SubElement(entry, "Option", type="QString", name=shown, value=value)

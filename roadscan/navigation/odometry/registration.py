@@ -108,7 +108,7 @@ class _Matcher:
             )
         )
         self.motion = motion
-        """Shift (m/s) and turn (rad/s) of the sensor in its own axes."""
+        """Shift (m/s) and turn (rad/s) of the sensor in its axes."""
         self._pose = np.eye(4)
         self._epochs: list[int] = []
         self._poses: list[Float64] = []

@@ -16,8 +16,7 @@ from roadscan.assets.tasks.tables import TABLES, read_layer
 from roadscan.core.extras import is_installed
 from roadscan.georeference.plan.plan import plan_of
 from roadscan.report.asset_thumbnails import Thumbnails
-from roadscan.report.blocks import Block, Drawing, Line, Picture, Table
-from roadscan.report.map_page import COLOURS, WIDTH, MapPage
+from roadscan.report.blocks import COLOURS, WIDTH, Block, Drawing, Line, MapPage, Picture, Table
 from roadscan.report.section import Material, Section
 from roadscan.store.asset_schema import AssetSchema, asset_schema, asset_tables
 from roadscan.tiles.tasks.wanted_products import product_context

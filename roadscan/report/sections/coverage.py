@@ -14,8 +14,7 @@ import numpy.typing as npt
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.ids import TileId
 from roadscan.georeference.plan.plan import NothingToPlaceError, plan_of
-from roadscan.report.blocks import Block, Drawing, Line, Table
-from roadscan.report.map_page import COLOURS, WIDTH, MapPage
+from roadscan.report.blocks import COLOURS, WIDTH, Block, Drawing, Line, MapPage, Table
 from roadscan.report.section import Material, Section
 from roadscan.report.sections.recorded import seconds_of
 from roadscan.store.manifest import OutputRecord

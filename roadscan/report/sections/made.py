@@ -28,7 +28,7 @@ from roadscan.tiles.product import products
 _EDGE: Final = 900
 """Longer edge of a small picture (pixels)."""
 _MOST_BYTES: Final = 512_000_000
-"""Largest file (bytes) that is held against its record before a small picture is made of it, or fetched for one."""
+"""Largest file (bytes) that is compared with its record before a small picture is made of it, or fetched for one."""
 _MOST_OF_A_PRODUCT: Final = 4  # small pictures of a product
 _SHOWN_ELSEWHERE: Final = (ADJUSTMENT_PICTURES, CONDITION_PICTURES, RAVELLING_PICTURES, REGION_PICTURES)
 _SUFFIXES: Final = (".tif", ".png", ".jpg")

@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from roadscan.compute.array_types import Float32, Float64
-from roadscan.simulate.kernels.chance import mixed
-from roadscan.simulate.kernels.options import compiled, inlined
+from roadscan.simulate.kernels.options import compiled, inlined, mixed
 
 NODE_SPREAD = 0.3697
 """Standard deviation of noise between nodes of even random numbers from −1 to 1: the mean over a cell of the cubic

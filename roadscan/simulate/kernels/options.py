@@ -1,10 +1,12 @@
-"""Compiler options of the simulator's kernels."""
+"""Compiler options of the simulator's kernels, and random numbers by counter."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
+
+import numpy as np
 
 from roadscan.compute import compiler
 
@@ -30,3 +32,12 @@ def inlined(function: _Function) -> _Function:
 
 
 _FOLDER = compiler.cache_folder("simulate", Path(__file__).parent.glob("*.py"))
+
+
+@inlined
+def mixed(counter: np.uint64) -> np.uint64:
+    """Return 64 random bits for a counter: the finaliser of SplitMix64 (Steele, Lea, Flood 2014)."""
+    z = counter * np.uint64(0x9E3779B97F4A7C15)
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))

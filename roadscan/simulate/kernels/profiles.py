@@ -9,8 +9,7 @@ import numpy as np
 
 from roadscan.compute.array_types import Bool, Float32, Float64, Int32, Int64, UInt8, UInt16
 from roadscan.simulate.kernels.beams import ROOT_TOLERANCE_M, along_beam, clearance, into_defect, turn_to_road
-from roadscan.simulate.kernels.chance import mixed
-from roadscan.simulate.kernels.options import compiled, inlined, inner
+from roadscan.simulate.kernels.options import compiled, inlined, inner, mixed
 from roadscan.simulate.kernels.road import (
     DEFECTS,
     DEFECTS_END,

@@ -9,9 +9,8 @@ import numpy as np
 
 from roadscan.compute.array_types import Bool, Float64, Int32, Int64
 from roadscan.simulate.kernels.beams import along_beam, through
-from roadscan.simulate.kernels.chance import mixed
 from roadscan.simulate.kernels.ground import CELL_M, TILE_CELLS, TILE_M, Cells, first_ground, into_hole
-from roadscan.simulate.kernels.options import compiled, inlined, inner
+from roadscan.simulate.kernels.options import compiled, inlined, inner, mixed
 from roadscan.simulate.kernels.road import (
     DEFECTS,
     DEFECTS_END,
@@ -55,7 +54,7 @@ BEST, HIT, NODE, PAST, OFFSET, DEPTH = 0, 1, 2, 3, 4, 5
 STATE_SIZE = 6  # numbers of a ray's search state
 
 GRASS_WAY_M = 1.0
-"""Longest way of a beam through grass (m): on longer ones the ground's own shape counts."""
+"""Longest way of a beam through grass (m): on longer ones the ground's shape counts."""
 GRASS_PATH_SHARE = 2.0
 """Mean free path of a beam in grass over the grass's height."""
 MIXED_WITHIN_M = 0.15
@@ -787,7 +786,7 @@ def is_within(echoes: Float64, s: int, low: float, high: float) -> bool:
 def is_one_surface(echoes: Float64, low: float, high: float) -> bool:
     """Return whether the echoes (5, 5) within ranges only come from the surface in the ray's middle.
 
-    So it is where other objects are met only where they touch it, and ranges on its own change evenly across the ray;
+    So it is where other objects are met only where they touch it, and ranges on it change evenly across the ray;
     where only one side of an axis belongs to the echoes, only the object decides.
     """
     if not is_within(echoes, 0, low, high):

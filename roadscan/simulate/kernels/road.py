@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from roadscan.compute.array_types import Bool, Float32, Float64, Int64
-from roadscan.simulate.kernels.chance import mixed
-from roadscan.simulate.kernels.options import compiled, inlined, inner
+from roadscan.simulate.kernels.options import compiled, inlined, inner, mixed
 
 NODE_STEP_M = 0.5
 """Distance from node to node of the reference line."""

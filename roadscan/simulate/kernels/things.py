@@ -10,8 +10,7 @@ import math
 import numpy as np
 
 from roadscan.compute.array_types import Float64
-from roadscan.simulate.kernels.chance import mixed
-from roadscan.simulate.kernels.options import inlined, inner
+from roadscan.simulate.kernels.options import inlined, inner, mixed
 
 BOX, CYLINDER, ELLIPSOID, WALL, DISC, TRIANGLE, OCTAGON, DIAMOND = 0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0
 """Kinds of bodies. Walls, discs and the four after them are thin, upright, and visible from both sides."""
@@ -27,7 +26,7 @@ BLACK_SHARE = 1.0 / 12.0  # intensity of the black parts of a control target as 
 KIND, EASTING, NORTHING, SINE, COSINE, HALF_LENGTH, HALF_WIDTH, LOW, HIGH = 0, 1, 2, 3, 4, 5, 6, 7, 8
 LOW_END, HIGH_END, SKIRT, ALONG, BAY, WINDOW, STOREY = 9, 10, 11, 12, 13, 14, 15  # columns of walls
 INTENSITY, DENSITY = 16, 17  # columns of all bodies
-PART = 18  # column of what a body is of its object: see `roadscan.simulate.semantics`
+PART = 18  # column of what a body is of its object: see `roadscan.simulate.bodies`
 BODY_COLUMNS = 19  # numbers of a body
 _OCTAGON_CUT = math.sqrt(2.0)
 """Sum of the shares of the half width at which a regular octagon's slanting sides lie."""

@@ -42,7 +42,7 @@ class PictureFaults(Strict):
     black: list[int] = []
     """Pictures without light: the noise alone."""
     doubled: list[int] = []
-    """Pictures whose file holds the picture before once more, under a stamp of its own."""
+    """Pictures whose file holds the picture before once more, under a separate stamp."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -125,7 +125,7 @@ _FURTHER: Final = pattern_in_words(
 
 
 class FurtherCamera(Camera):
-    """A further camera of the rig, with its own mounting, lens and clock."""
+    """A further camera of the rig, with its mounting, lens and clock."""
 
     on: bool = True
     """Whether the rig carries it."""

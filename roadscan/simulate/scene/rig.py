@@ -206,7 +206,7 @@ class GnssGap(Strict):
 
 
 class Gnss(Strict):
-    """A GNSS receiver with real-time kinematic corrections: its own solution, without the IMU."""
+    """A GNSS receiver with real-time kinematic corrections: its solution, without the IMU."""
 
     on: bool = False
     """Whether its solutions are logged (RTKLIB .pos and NMEA)."""
@@ -238,7 +238,7 @@ class Encoder(Strict):
     """A wheel encoder: counts the path that a rear wheel drives."""
 
     on: bool = False
-    """Whether a log of its own is written; profiles carry its count in any case."""
+    """Whether a separate log is written; profiles carry its count in any case."""
     rate_hz: float = Field(default=50.0, ge=1.0, le=1000.0)
     """Records a second."""
     ticks_per_m: float = Field(default=1000.0, gt=0)
@@ -332,7 +332,7 @@ class Trajectory(Strict):
 
 
 class Odometry(Strict):
-    """The poses of an odometry in a bag: in a frame of its own (`odom`) that begins at the first of them, so that it is
+    """The poses of an odometry in a bag: in a separate frame (`odom`) that begins at the first of them, so that it is
     no trajectory in the map. Its σ are not stated, as most odometries leave them.
     """
 
@@ -350,7 +350,7 @@ class Bag(Strict):
     """The recording of a low-cost rig: one ROS bag with the lidar's clouds, the IMU and the receiver's positions."""
 
     on: bool = False
-    """Whether lidar, IMU and receiver are recorded in a bag, in place of logs of their own."""
+    """Whether lidar, IMU and receiver are recorded in a bag, in place of separate logs."""
     container: Literal["mcap", "sqlite", "ros1"] = "mcap"
     """A ROS 2 bag of MCAP or SQLite, or a bag of ROS 1."""
     livox: Literal["CustomMsg", "PointCloud2"] = "CustomMsg"

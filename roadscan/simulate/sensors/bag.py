@@ -2,13 +2,19 @@
 
 Vehicle and sensors have axes x ahead, y left, z up (REP 103). A cloud is a turn of the head (of a Mid-360 a frame, in
 the messages of Livox's driver); `t` counts nanoseconds from the header's stamp (as Ouster's driver writes it). Stamps
-are Unix UTC of each sensor's own clock; messages arrive late by random times, in the order of their arrival. An
+are Unix UTC of each sensor's clock; messages arrive late by random times, in the order of their arrival. An
 odometry, where the scene has one, is the pose since the start, with an error that grows with the way.
+
+Writes messages of Livox's driver (livox_ros_driver2/CustomMsg), serialised here: objects of single points are slow.
+
+ROS 2 lays each number at a multiple of its size, counted from the fifth byte (CDR, little-endian), ROS 1 all fields one
+after another. Coordinates are whole millimetres, as the sensor sends them; a firing without a return is 0, 0, 0.
 """
 
 from __future__ import annotations
 
 import heapq
+import struct
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -25,9 +31,9 @@ from roadscan.simulate.drive import Drive
 from roadscan.simulate.lidar_model import lidar_model
 from roadscan.simulate.noise import stream
 from roadscan.simulate.scene import ClockError, Mount, Scene
-from roadscan.simulate.sensors import gnss, imu, lidar, livox
+from roadscan.simulate.sensors import gnss, imu, lidar
 from roadscan.simulate.sensors.clock import SensorClock
-from roadscan.simulate.sensors.lidar import BODY_FROM_AXES
+from roadscan.simulate.sensors.lidar import BODY_FROM_AXES, Packets
 
 CLOUDS: Final = "/lidar/points"
 IMU: Final = "/imu/data"
@@ -68,7 +74,7 @@ def _is_livox(scene: Scene) -> bool:
 
 def _types(scene: Scene) -> dict[str, str]:
     """Return the type of each topic."""
-    types = _TYPES | ({CLOUDS: livox.MESSAGE} if _is_livox(scene) else {})
+    types = _TYPES | ({CLOUDS: MESSAGE} if _is_livox(scene) else {})
     return types | ({ODOMETRY: "nav_msgs/msg/Odometry"} if scene.bag.odometry.on else {})
 
 
@@ -89,7 +95,7 @@ def write_bag(scene: Scene, world: World | None, drive: Drive, bag: Path, hits_f
     is_ros1, types = scene.bag.container == "ros1", _types(scene)
     kinds = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
     trees = {_TYPES[MOUNTINGS]: "geometry_msgs/TransformStamped[] transforms\n"} if is_ros1 else {}
-    for name, text in (livox.DEFINITIONS | trees).items():
+    for name, text in (DEFINITIONS | trees).items():
         kinds.register(get_types_from_msg(text, name))
     messages = _Messages(scene, drive, kinds.types)
     with ExitStack() as stack:
@@ -246,18 +252,18 @@ class _Messages:
             now = epochs < upto
             pending[:] = [(epochs[~now], points[~now])]
             stamp = int(clock.stamps_ns(np.array([begun]))[0])
-            own = points[now].copy()
-            own["t"] = np.maximum(clock.stamps_ns(epochs[now]) - stamp, 0)  # jitter may put one before its turn
+            sweep = points[now].copy()
+            sweep["t"] = np.maximum(clock.stamps_ns(epochs[now]) - stamp, 0)  # jitter may put one before its turn
             if is_livox:
-                message = livox.serialised(own, stamp, "lidar", number, is_ros1=is_ros1)
-                yield begun + turn_ns, message, int(np.count_nonzero(own["intensity"]))
+                message = serialised(sweep, stamp, "lidar", number, is_ros1=is_ros1)
+                yield begun + turn_ns, message, int(np.count_nonzero(sweep["intensity"]))
                 return
-            yield begun + turn_ns, self._cloud(stamp, own, number), own.size
+            yield begun + turn_ns, self._cloud(stamp, sweep, number), sweep.size
 
         for block in lidar.measure(self.scene, world, self.drive):
             if hits is not None:
                 hits.write_batch(lidar.hits_of(block))
-            pending.append(livox.firings(block) if is_livox else _points(block))
+            pending.append(firings(block) if is_livox else _points(block))
             while block.epoch_gps_ns[-1] >= begun + turn_ns:
                 yield from cloud(begun + turn_ns)
                 begun, number = begun + turn_ns, number + 1
@@ -285,3 +291,44 @@ def _points(block: lidar.Packets) -> tuple[npt.NDArray[np.int64], npt.NDArray[np
     out["z"] = range_m * np.sin(elevation) + block.model.rise_m[laser]
     out["intensity"], out["ring"] = block.intensity[seen], laser
     return block.stamped_gps_ns()[seen], out
+
+
+MESSAGE: Final = "livox_ros_driver2/msg/CustomMsg"
+DEFINITIONS: Final = {
+    "livox_ros_driver2/msg/CustomPoint": "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\n"
+    "uint8 reflectivity\nuint8 tag\nuint8 line\n",
+    MESSAGE: "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\n"
+    "CustomPoint[] points\n",
+}
+"""Definitions of the messages, of the driver's public repository."""
+POINT: Final = np.dtype([
+    ("t", "<u4"), ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "u1"), ("tag", "u1"), ("line", "u1"),
+    ("_", "u1"),
+])  # fmt: skip
+"""A point as ROS 2 lays it; the last byte, which the last point of a message lacks, is none of ROS 1."""
+_LITTLE_ENDIAN: Final = b"\0\1\0\0"  # begin of a message of ROS 2
+
+
+def firings(block: Packets) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.void]]:
+    """Return stamped epochs (m,) and points (m,) of all firings of a block; `t` is not filled in."""
+    out = np.zeros(block.ranges.shape, POINT)
+    range_mm = 1000.0 * block.model.figures.range_step_m * block.ranges
+    azimuth, elevation = np.radians(block.azimuth_deg), np.radians(block.elevation_deg)
+    flat = range_mm * np.cos(elevation)
+    for axis, value in zip("xyz", (flat * np.cos(azimuth), -flat * np.sin(azimuth), range_mm * np.sin(elevation)),
+                           strict=True):  # fmt: skip
+        out[axis] = np.rint(value) / 1000.0
+    out["intensity"], out["line"] = block.intensity, np.arange(block.model.lasers)
+    return block.stamped_gps_ns().ravel(), out.ravel()
+
+
+def serialised(points: npt.NDArray[np.void], stamp_ns: int, frame: str, number: int, *, is_ros1: bool) -> bytes:
+    """Return the message of a frame: its first point has the stamp, and `t` counts from there."""
+    name, seconds = frame.encode("ascii"), divmod(stamp_ns, NS_PER_S)
+    counts = struct.pack("<QI4xI", stamp_ns, points.size, points.size)
+    if is_ros1:
+        packed = points.view(np.uint8).reshape(points.size, -1)[:, :-1].tobytes()
+        return struct.pack(f"<IIII{len(name)}s", number, *seconds, len(name), name) + counts + packed
+    header = struct.pack(f"<iII{len(name) + 1}s", *seconds, len(name) + 1, name)
+    header += bytes(-len(header) % 8)
+    return (_LITTLE_ENDIAN + header + counts + points.tobytes())[: -1 if points.size else None]

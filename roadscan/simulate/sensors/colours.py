@@ -75,8 +75,8 @@ class Tints:
         """Return shares (n, 3) for the n rays of the first group; those of the sky for rays without a hit."""
         number, place = hits.object_id[0], hits.enh_m[0]
         out = np.where((number >= 0)[:, None], self._of_object[np.maximum(number, 0)], SKY)
-        for own, face in self._faces.items():
-            rows = np.flatnonzero(number == own)
+        for face_number, face in self._faces.items():
+            rows = np.flatnonzero(number == face_number)
             if rows.size:
                 out[rows] = _on_face(face, place[rows] - self._world.surface.origin_enh_m, hits.intensity[0][rows])
         if self._stripes:

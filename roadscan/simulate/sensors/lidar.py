@@ -151,9 +151,9 @@ def errors_of(scene: Scene) -> ModelErrors:
     )
     if scene.lidar.errors == "noise":
         return none
-    own = lidar_model(scene.lidar.model).figures.errors
-    lost = own.dropout + noise.dropout - own.dropout * noise.dropout
-    return own.model_copy(update={"range_m": math.hypot(own.range_m, noise.lidar_range_m), "dropout": lost})
+    stated = lidar_model(scene.lidar.model).figures.errors
+    lost = stated.dropout + noise.dropout - stated.dropout * noise.dropout
+    return stated.model_copy(update={"range_m": math.hypot(stated.range_m, noise.lidar_range_m), "dropout": lost})
 
 
 def _strew(rng: np.random.Generator, model: LidarModel, errors: ModelErrors, found: Hits) -> None:
@@ -239,7 +239,7 @@ def _aim(scene: Scene, start_deg: float, numbers: Int64) -> Aim:
         fired_s = 1e-9 * (figures.cycle_ns * cycle[:, :, None] + model.firing_ns).astype(np.float64)
         azimuth_deg, elevation_deg = figures.rosette.aimed(fired_s, start_deg, model.elevation_deg)
         return Aim(np.zeros(cycle.shape, np.uint16), np.mod(azimuth_deg, 360.0), elevation_deg)
-    if figures.columns is not None and not scene.bag.on:  # columns begin at their own angles, packets with whole ones
+    if figures.columns is not None and not scene.bag.on:  # columns begin at their angles, packets with whole ones
         per_cycle = 36_000.0 / figures.columns
         start_deg = PACKET_COLUMNS * 360.0 / figures.columns * (int(start_deg) % (figures.columns // PACKET_COLUMNS))
     elif scene.lidar.on_azimuth_grid:

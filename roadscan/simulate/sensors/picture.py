@@ -162,7 +162,7 @@ class _Eye:
         self.down: Float64 = level[:, 2]
         """(3,) downwards."""
         self._states: npt.NDArray[np.int8] | None = None
-        """(h, w) whether pixels and those around them are lit or dark, once the picture's own rays were cast."""
+        """(h, w) whether pixels and those around them are lit or dark, once the picture's rays were cast."""
         self._suns = self.sun[None, None] + np.zeros((len(self._shutter.epochs), 2, 1))
         if self._shutter.rolls:
             ends = drive.poses(self._shutter.epochs.ravel()).sensor(self._camera.mount, EYE)[1]

@@ -232,8 +232,8 @@ def _hits_schema(readings: int) -> pa.Schema:
 def _hits(scanner: Scanner, block: Scans, schema: pa.Schema) -> pa.RecordBatch:
     """Return the origins of a block's readings."""
     codes_from = (1 << scanner.range_bits) - _CODES
-    own = np.arange(scanner.turns)[:, None] == scanner.turn_of
-    seen = (block.values < codes_from)[:, None, :] & own
+    in_turn = np.arange(scanner.turns)[:, None] == scanner.turn_of
+    seen = (block.values < codes_from)[:, None, :] & in_turn
     found = block.found
     places = [*np.moveaxis(found.enh_m, -1, 0), found.range_m]
     columns = [np.where(seen, place[:, None, :], np.nan) for place in places]

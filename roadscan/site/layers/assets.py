@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 import shapely
 
 from roadscan.inventory.homes.page_edits import LAYER
-from roadscan.site import evidence
+from roadscan.site import layer
 from roadscan.site.layer import (
     BLUE,
     GOOD_TO_POOR,
@@ -56,36 +56,36 @@ class Assets(LayerKind):
         """Yield a layer for each kind with any object."""
         is_inventory = material.inventory is not None
         for place, (kind, colour) in enumerate(zip(asset_kind_names(), cycle(_COLOURS), strict=False)):
-            held = _of_inventory(material, kind) if is_inventory else _found(material, kind)
-            if held is not None and held[0].num_rows:
+            content = _of_inventory(material, kind) if is_inventory else _found(material, kind)
+            if content is not None and content[0].num_rows:
                 order = (400 if asset_schema(kind).found_in else 600) + place
-                yield _layer(material, kind, held, order, colour)
+                yield _layer(material, kind, content, order, colour)
 
 
 def _found(material: Material, kind: str) -> _Rows | None:
     """Return the rows of the newest run, whose tables are below `products/assets`."""
     path = f"{FOLDER}/{asset_schema(kind).table}.parquet"
-    held = material.rows_of([r for r in material.session.manifest.all() if r.path == path])
-    return None if held is None or held.shapes_m is None else (held.rows, held.shapes_m)
+    content = material.rows_of([r for r in material.session.manifest.all() if r.path == path])
+    return None if content is None or content.shapes_m is None else (content.rows, content.shapes_m)
 
 
 def _of_inventory(material: Material, kind: str) -> _Rows | None:
     """Return the rows of the inventory today, without those that people rejected; shapes in metres."""
     shown = material.inventory
-    own = None if shown is None else shown[1].assets.get(kind)
-    if own is None:
+    assets = None if shown is None else shown[1].assets.get(kind)
+    if assets is None:
         return None
-    keep = pc.not_equal(own.rows["status"], "rejected")
+    keep = pc.not_equal(assets.rows["status"], "rejected")
     frame = material.context.map
     units_m = [frame.horizontal_unit_m, frame.horizontal_unit_m, frame.vertical_unit_m]
-    shapes = own.shapes[keep.to_numpy()]
+    shapes = assets.shapes[keep.to_numpy()]
     if units_m != [1.0, 1.0, 1.0]:
         shapes = shapely.transform(shapes, lambda places: places * units_m, include_z=True)
-    return own.rows.filter(keep).drop_columns([GEOMETRY]), shapes
+    return assets.rows.filter(keep).drop_columns([GEOMETRY]), shapes
 
 
-def _layer(material: Material, kind: str, held: _Rows, order: int, colour: str) -> SiteLayer:
-    schema, (rows, shapes_m) = asset_schema(kind), held
+def _layer(material: Material, kind: str, content: _Rows, order: int, colour: str) -> SiteLayer:
+    schema, (rows, shapes_m) = asset_schema(kind), content
     is_inventory, geometry = "asset_id" in rows.column_names, GEOMETRY_OF[schema.geometry]
     columns = {c.name: c for c in (asset_columns(kind) if is_inventory else schema.columns)}
     names = [n for n in rows.column_names if n in columns]
@@ -106,7 +106,7 @@ def _layer(material: Material, kind: str, held: _Rows, order: int, colour: str) 
 def _evidence(material: Material, row: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the evidence for an asset: pictures, the passes of its first and last return, its place on the strips."""
     epochs = (row.get("first_epoch_gps_ns"), row.get("last_epoch_gps_ns"))
-    return [*evidence.of_pictures(material, row), *evidence.of_passes(material, epochs), *evidence_of_row(row)]
+    return [*layer.of_pictures(material, row), *layer.of_passes(material, epochs), *evidence_of_row(row)]
 
 
 def _styles(schema: AssetSchema, width_px: float) -> Iterator[Style]:

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
-from roadscan.site import evidence
+from roadscan.site import layer
 from roadscan.site.layer import BLUE, RED, LayerKind, SiteLayer, Style, schema_columns
 from roadscan.site.material import Material
 from roadscan.store.readings.row_groups import read_groups
@@ -35,9 +35,9 @@ class Control(LayerKind):
 
     def layers(self, material: Material) -> Iterator[SiteLayer]:
         """Yield one layer; none without surveyed points."""
-        held = material.table("control_residuals")
-        if held is not None and held.rows.num_rows:
-            yield _layer(material, "control_residuals", held.rows, _ARROWS)
+        content = material.table("control_residuals")
+        if content is not None and content.rows.num_rows:
+            yield _layer(material, "control_residuals", content.rows, _ARROWS)
             return
         points = [
             read_groups(material.store, file.path, range(len(file.group_rows)))
@@ -57,7 +57,7 @@ def _layer(material: Material, table: str, rows: pa.Table, arrows: dict[str, Any
         [*_RESIDUAL_STYLES, _STYLE] if arrows else [_STYLE],
         key="name", label="name", arrows=arrows,
         evidence=[
-            list(evidence.of_passes(material, [row.get("epoch_gps_ns")], row["run"])) if row.get("run") else []
+            list(layer.of_passes(material, [row.get("epoch_gps_ns")], row["run"])) if row.get("run") else []
             for row in rows.to_pylist()
         ],
     )  # fmt: skip

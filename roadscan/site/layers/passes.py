@@ -12,7 +12,7 @@ import shapely
 
 from roadscan.core.gpstime import utc_from_gps_ns
 from roadscan.navigation.tasks.trajectories import TrajectorySource
-from roadscan.site import evidence
+from roadscan.site import layer
 from roadscan.site.layer import (
     BLUE,
     GREEN,
@@ -53,10 +53,10 @@ class Passes(LayerKind):
             if one.run not in paths:
                 continue
             epochs, places_m = paths[one.run]
-            own = places_m[(epochs >= one.start_gps_ns) & (epochs <= one.end_gps_ns)]
-            if not len(own):
+            track_m = places_m[(epochs >= one.start_gps_ns) & (epochs <= one.end_gps_ns)]
+            if not len(track_m):
                 continue
-            shapes.append(shapely.simplify(line_of(own), _FAITHFUL_M))
+            shapes.append(shapely.simplify(line_of(track_m), _FAITHFUL_M))
             times = [utc_from_gps_ns(t).isoformat(timespec="seconds") for t in (one.start_gps_ns, one.end_gps_ns)]
             rows.append(
                 {
@@ -72,7 +72,7 @@ class Passes(LayerKind):
         yield SiteLayer(
             about.name, about.title, about.group, about.geometry, about.order, np.array(shapes, object), rows,
             _COLUMNS, about.styles, about.key,
-            evidence=[list(evidence.of_run(material, row["run"])) for row in rows],
+            evidence=[list(layer.of_run(material, row["run"])) for row in rows],
         )  # fmt: skip
 
 

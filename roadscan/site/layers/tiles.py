@@ -11,7 +11,7 @@ import shapely
 
 from roadscan.core.errors import DamagedError, RoadscanError
 from roadscan.core.ids import TileId
-from roadscan.site import evidence
+from roadscan.site import layer
 from roadscan.site.layer import (
     BLUE,
     GREY,
@@ -44,12 +44,12 @@ class Tiles(LayerKind):
         """Yield one layer; none where nothing is known of any tile."""
         keys, known = _keys(material)
         failed = {one["unit"]: one["reason"] for one in read_failures(material.store) if one.get("stage") == "tiles"}
-        held = {t: str(t) for t in {*material.tiles, *keys} if str(t) in failed or t in material.tiles or t in keys}
+        names = {t: str(t) for t in {*material.tiles, *keys} if str(t) in failed or t in material.tiles or t in keys}
         empty = material.session.manifest.without_file(TILE)
-        tiles = [t for t in sorted(held, key=lambda t: (t.row, t.column)) if held[t] not in empty]
+        tiles = [t for t in sorted(names, key=lambda t: (t.row, t.column)) if names[t] not in empty]
         rows = []
         for tile in tiles:
-            unit = held[tile]
+            unit = names[tile]
             current = tile in keys and material.session.manifest.is_current(TILE, unit, keys[tile])
             state = "failed" if unit in failed else "done" if current else "stale" if known else "not known"
             rows.append(_row(tile, state, failed.get(unit), material.summaries.get(tile)))
@@ -68,7 +68,7 @@ class Tiles(LayerKind):
                 SiteColumn("passes", "", "Passes that saw it, separated by spaces."),
             ],
             [Style("State", 1, by="state", values=_STATES)], key="tile", visible=False,
-            evidence=[[evidence.of_pass(material, int(one)) for one in row["passes"].split()] for row in rows],
+            evidence=[[layer.of_pass(material, int(one)) for one in row["passes"].split()] for row in rows],
         )  # fmt: skip
 
 

@@ -83,7 +83,7 @@ class Lane:
 
     @functools.cached_property
     def pieces(self) -> list[dict[str, Any]]:
-        """Pieces of its values; none where its own file has them."""
+        """Pieces of its values; none where its file has them."""
         if not self.is_long:
             return []
         begins = {name: min(_first_station(self, one) for one in own) for name, own in self.groups.items()}

@@ -41,7 +41,7 @@ class KeyedCrs(NamedTuple):
     crs: pyproj.CRS | None
     """Compound where the keys state a vertical datum, even one without a name; None where they state no CRS."""
     false_origin_units: tuple[pyproj.CRS, pyproj.CRS] | None = None
-    """The CRS with a false origin in its own unit, and with one in metres, where PROJ knows neither and both can be
+    """The CRS with a false origin in its unit, and with one in metres, where PROJ knows neither and both can be
     meant: older programs wrote metres whatever the unit."""
 
 

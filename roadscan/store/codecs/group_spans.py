@@ -109,7 +109,7 @@ def _ends(packed: bytes) -> tuple[Int64, Int64]:
 
 
 class GroupRows(Sequence[int]):
-    """Rows of row groups, held as runs of equal ones; equal to a tuple of the same numbers."""
+    """Rows of row groups, stored as runs of equal ones; equal to a tuple of the same numbers."""
 
     __slots__ = ("_ends", "runs")
 
@@ -117,7 +117,7 @@ class GroupRows(Sequence[int]):
     """Number of neighbouring row groups, and the rows of each."""
 
     def __init__(self, rows: Iterable[int] = ()) -> None:
-        self._hold((len(list(own)), count) for count, own in itertools.groupby(rows))
+        self._hold((len(list(equal)), count) for count, equal in itertools.groupby(rows))
 
     def _hold(self, runs: Iterable[tuple[int, int]]) -> Self:
         self.runs = tuple((groups, rows) for groups, rows in runs)

@@ -25,8 +25,8 @@ def beside(place: Path) -> Path:
     """Return a new name beside a file or folder; what processes that are dead left under such names is removed."""
     start = f".{place.name}-"
     for left in place.parent.iterdir() if place.parent.is_dir() else ():
-        own = left.name.removeprefix(start)
-        if left.name.startswith(start) and _MADE.fullmatch(own) and tag_lives(own) is False:
+        tag = left.name.removeprefix(start)
+        if left.name.startswith(start) and _MADE.fullmatch(tag) and tag_lives(tag) is False:
             shutil.rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink(missing_ok=True)
     return place.parent / f"{start}{own_tag()}-{uuid.uuid4().hex}"
 

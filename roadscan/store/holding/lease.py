@@ -87,13 +87,13 @@ class Place(Protocol):
     def read(self) -> Held | None:
         """Return the lease that stands there, None where none does."""
 
-    def renew(self, held: Held) -> None:
+    def renew(self, lease: Held) -> None:
         """Let the store's clock say that the lease was renewed now."""
 
-    def replace(self, held: Held, content: bytes) -> bool:
+    def replace(self, lease: Held, content: bytes) -> bool:
         """Put another lease in the place of this one if it still stands; return whether it did."""
 
-    def drop(self, held: Held) -> None:
+    def drop(self, lease: Held) -> None:
         """Free the store if the lease is still this one."""
 
     def now_s(self) -> float:
@@ -113,8 +113,8 @@ class Lease:
 
     def check_free(self) -> None:
         """Raise StoreError where another process holds the lease now."""
-        if (held := self._place.read()) is not None:
-            _check_over(held, self._place)
+        if (lease := self._place.read()) is not None:
+            _check_over(lease, self._place)
 
     def take(self) -> None:
         """Take the lease, and renew it from now on.
@@ -132,8 +132,8 @@ class Lease:
         self._ended.set()
         self._renewal.join()
         with contextlib.suppress(Exception):
-            if (held := self._place.read()) is not None and held.name == self._name:
-                self._place.drop(held)
+            if (lease := self._place.read()) is not None and lease.name == self._name:
+                self._place.drop(lease)
 
     def check(self) -> None:
         """Raise StoreError where the lease is another's: this process slept, or did not reach the store."""
@@ -156,13 +156,13 @@ class Lease:
             self._renewed_s = _awake_s()
             if self._place.create(content):
                 return
-            held = self._place.read()
-            if held is None:
+            lease = self._place.read()
+            if lease is None:
                 continue
-            if held.name == self._name:  # the answer to the first request was lost, and it was sent again
+            if lease.name == self._name:  # the answer to the first request was lost, and it was sent again
                 return
-            _check_over(held, self._place)
-            if self._place.replace(held, content):
+            _check_over(lease, self._place)
+            if self._place.replace(lease, content):
                 return
         raise BusyStoreError("the store's lock changes hands all the time", change="run again", file=self._place.path)
 
@@ -174,19 +174,19 @@ class Lease:
         """Renew the lease if it is still this one's; a store that does not answer is asked again later."""
         with contextlib.suppress(Exception):
             at = _awake_s()
-            held = self._place.read()
-            if held is None:
+            lease = self._place.read()
+            if lease is None:
                 self._lost = "its lock was removed"
-            elif held.name != self._name:
-                self._lost = f"{held.process or 'another process'} has taken it"
+            elif lease.name != self._name:
+                self._lost = f"{lease.process or 'another process'} has taken it"
             else:
-                self._place.renew(held)
+                self._place.renew(lease)
                 self._renewed_s = at
 
 
-def _check_over(held: Held, place: Place) -> None:
+def _check_over(lease: Held, place: Place) -> None:
     """Raise StoreError where the holder of a lease may be at work."""
-    process, older = held.process, held.older_holder
+    process, older = lease.process, lease.older_holder
     lives = None if process is None else process.lives
     if lives:
         raise _in_use(str(process), "wait for it")
@@ -198,7 +198,7 @@ def _check_over(held: Held, place: Place) -> None:
         raise _in_use(f"process {older[1]} on {older[0]}", f"wait for it, or remove {place.path} if it is gone")
     if process is None:
         return  # text that no run writes
-    silent_s = place.now_s() - held.renewed_s
+    silent_s = place.now_s() - lease.renewed_s
     if silent_s <= LEASE_S:
         raise _in_use(
             f"{process} (seen {max(silent_s, 0.0):.0f} s ago)",
@@ -250,26 +250,26 @@ class FolderPlace:
                 f"the store's lock cannot be read: {error}", change="remove it if no run is at work", file=self._file
             ) from error
 
-    def renew(self, held: Held) -> None:
+    def renew(self, lease: Held) -> None:
         """Set the file's time to the server's own now."""
         os.utime(self._file)
 
-    def replace(self, held: Held, content: bytes) -> bool:
+    def replace(self, lease: Held, content: bytes) -> bool:
         """Take the lease away under another name, look whether it is the one, and give its name to the new one."""
         made = self._probe()
         made.write_bytes(content)
         try:
             with self._alone(self._file.parent):
-                return self._taken_away(held) and _given(made, self._file)
+                return self._taken_away(lease) and _given(made, self._file)
         finally:
             made.unlink(missing_ok=True)
 
-    def drop(self, held: Held) -> None:
+    def drop(self, lease: Held) -> None:
         """Remove the file if it still names the holder."""
         with self._alone(self._file.parent):
-            self._taken_away(held)
+            self._taken_away(lease)
 
-    def _taken_away(self, held: Held) -> bool:
+    def _taken_away(self, lease: Held) -> bool:
         """Remove the lease; put it back, and return False, where it is another one by now."""
         aside = self._probe()
         try:
@@ -277,7 +277,7 @@ class FolderPlace:
         except FileNotFoundError:
             return False
         try:
-            if aside.read_bytes() == held.content:
+            if aside.read_bytes() == lease.content:
                 return True
             _given(aside, self._file)
             return False
@@ -342,25 +342,25 @@ class ObjectPlace:
         except FileNotFoundError:
             return None
 
-    def renew(self, held: Held) -> None:
+    def renew(self, lease: Held) -> None:
         """Write it again, where the store can do so only if it is still this one."""
-        self._fs.pipe_file(self._path, held.content, **self._only_if(held))
+        self._fs.pipe_file(self._path, lease.content, **self._only_if(lease))
 
-    def replace(self, held: Held, content: bytes) -> bool:
+    def replace(self, lease: Held, content: bytes) -> bool:
         """Write another lease over it, where the store can do so only if it is still this one; read it again."""
         try:
-            self._fs.pipe_file(self._path, content, **self._only_if(held))
+            self._fs.pipe_file(self._path, content, **self._only_if(lease))
         except OSError:
             found = self.read()
-            if found is not None and found.version == held.version:
+            if found is not None and found.version == lease.version:
                 raise  # since nobody else was faster: the store cannot be written
             return False
         found = self.read()
         return found is not None and found.content == content
 
-    def drop(self, held: Held) -> None:
+    def drop(self, lease: Held) -> None:
         """Empty the object: a removal has no condition, and could take away the lease of the next run."""
-        self.replace(held, b"")
+        self.replace(lease, b"")
 
     def now_s(self) -> float:
         """Return the store's time of an object that is written now."""
@@ -372,8 +372,8 @@ class ObjectPlace:
             with contextlib.suppress(OSError):
                 self._fs.rm_file(made)
 
-    def _only_if(self, held: Held) -> dict[str, str]:
-        return {"IfMatch": held.version} if self._is_s3 and held.version else {}
+    def _only_if(self, lease: Held) -> dict[str, str]:
+        return {"IfMatch": lease.version} if self._is_s3 and lease.version else {}
 
 
 def changed_s(info: dict[str, Any]) -> float:

@@ -25,12 +25,12 @@ class Look:
     """One store's names, as listed when the first question came."""
 
     def __init__(self, fs: Any, root: str, before: Look | None = None) -> None:
-        """`before` is an earlier look at the same store: the contents that it kept hold where their names do (ETag)."""
+        """Reuse what an earlier look (`before`) read of the same store, where names of content (ETag) are equal."""
         self._fs, self._root = fs, root
         self._before = {} if before is None else before._named_contents()
         """Contents that were read before the listing, by path and ETag."""
         self._states: dict[str, str] = {}
-        """The store's own name of each content as it was listed."""
+        """The store's name of each content as it was listed."""
         self._sizes: dict[str, int] | None = None
         self._folders: Counter[str] = Counter()
         """Number of files below each folder."""

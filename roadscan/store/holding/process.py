@@ -1,4 +1,4 @@
-"""Processes told apart, and whether they live: also where machines share a name, and containers share numbers."""
+"""Identifies processes, and finds whether they live, also where machines share a name and containers share numbers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _START_FIELD: Final = 19
 
 @dataclass(frozen=True)
 class Process:
-    """A process, told apart from all others: hosts and containers may have one name, and numbers are given anew."""
+    """A process, distinguished from all others: hosts and containers may have one name, and numbers are given anew."""
 
     host: str
     """Name of its machine, for words alone."""
@@ -29,7 +29,7 @@ class Process:
     """Namespace of process numbers (containers have their own), empty where the system has none."""
     pid: int
     started: str
-    """When it started, in the system's own count; empty where that is not known."""
+    """When it started, in the system's count; empty where that is not known."""
 
     @classmethod
     def this(cls) -> Self:

@@ -19,8 +19,7 @@ from roadscan.store.asset_schema import ASSET_FOLDER, asset_tables
 from roadscan.store.logs import log_of, read_log_records, table_of
 from roadscan.store.manifest import Manifest
 from roadscan.store.query.sql_files import PROTOCOL, OpenedFiles, StoreFiles, url
-from roadscan.store.readings.packed_returns import PACKED
-from roadscan.store.readings.packed_view import beams_query, returns_query
+from roadscan.store.readings.packed_returns import PACKED, beams_query, returns_query
 from roadscan.store.schema import schema_names, table_schema
 from roadscan.store.store import Store
 from roadscan.store.verified import faults_of_opened, recorded_files
@@ -51,7 +50,7 @@ _NO_EXTENSIONS = (
 )
 """Settings that prevent downloads, confined or not; files are opened when they are used."""
 _MEMORY_SHARE: Final = "40%"
-"""DuckDB's own default is 80 %, which leaves no room for an answer beside it, nor for a run on the same machine."""
+"""DuckDB's default is 80 %, which leaves no room for an answer beside it, nor for a run on the same machine."""
 _SPILT: Final = 4
 """An unconfined statement may write so many times its memory to a temporary folder, which ends with it."""
 _BATCH_ROWS: Final = 100_000

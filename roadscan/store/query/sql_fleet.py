@@ -51,13 +51,13 @@ class FleetStores:
         files = FleetFiles([member.store for member in self._members])
         connection.register_filesystem(files)
         add_utc(connection)
-        held = [_tables(member, damaged) for member in self._members]
+        tables = [_tables(member, damaged) for member in self._members]
         shut: dict[str, StoreError] = {}
-        logs = [statements_of(one.of_logs) for one in held]
+        logs = [statements_of(one.of_logs) for one in tables]
         known = {name for one in logs for name in one}
         rows = [
-            {name: rows_of(urls, filename=name in PER_TILE) for name, urls in one.made.items()} | own
-            for one, own in zip(held, logs, strict=True)
+            {name: rows_of(urls, filename=name in PER_TILE) for name, urls in one.made.items()} | of_files
+            for one, of_files in zip(tables, logs, strict=True)
         ]
         for name in dict.fromkeys(name for one in rows for name in one):
             parts = [
@@ -77,7 +77,7 @@ class FleetStores:
                 connection.register(name, table_schema(name).arrow().empty_table())
         outputs = [
             one.outputs.add_column(0, "survey", pa.array([member.store.survey_id] * one.outputs.num_rows, pa.string()))
-            for member, one in zip(self._members, held, strict=True)
+            for member, one in zip(self._members, tables, strict=True)
             if one.outputs.num_rows
         ]
         if outputs:
@@ -86,7 +86,7 @@ class FleetStores:
         def faults() -> list[AnswerError]:
             return [
                 fault
-                for member, one in zip(self._members, held, strict=True)
+                for member, one in zip(self._members, tables, strict=True)
                 if (opened := files.of(member.store).opened)
                 for fault in faults_of_opened(member.store, opened, one.recorded)
             ]
@@ -181,5 +181,5 @@ def _part(connection: duckdb.DuckDBPyConnection, store: Store, rows: str) -> str
     shapes = [f'CAST("{one}" AS GEOMETRY) AS "{one}"' for one, kind, *_ in columns if kind.startswith("GEOMETRY")]
     others = f" REPLACE ({', '.join(shapes)})" if shapes else ""
     # The folder of the store is a column too, which may look like a number.
-    own = " EXCLUDE (survey)" if "survey" in {one for one, *_ in columns} else ""
-    return f"(SELECT '{name}' AS survey, *{own}{others} FROM ({rows}))"
+    without = " EXCLUDE (survey)" if "survey" in {one for one, *_ in columns} else ""
+    return f"(SELECT '{name}' AS survey, *{without}{others} FROM ({rows}))"

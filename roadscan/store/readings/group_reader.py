@@ -18,7 +18,7 @@ from roadscan.store.readings.byte_source import HeldBytes, opened
 from roadscan.store.store import Store
 
 Footer: TypeAlias = tuple[HeldBytes, pq.FileMetaData, bool]
-"""An open file, its footer, and whether roadscan's own writer wrote it."""
+"""An open file, its footer, and whether roadscan's writer wrote it."""
 Rows = TypeVar("Rows")
 Pages = TypeVar("Pages", bound=PageFile)
 

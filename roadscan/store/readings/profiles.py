@@ -13,8 +13,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from roadscan.store.codecs.parquet.list_file import ListTableFile
-from roadscan.store.codecs.parquet.page_file import DamageError
+from roadscan.store.codecs.parquet.page_file import DamageError, ListTableFile
 from roadscan.store.readings.group_reader import Footer, GroupReader
 from roadscan.store.store import Store
 

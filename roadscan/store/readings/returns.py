@@ -14,8 +14,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.compute.array_types import Float32, Float64, Int64
-from roadscan.store.codecs.parquet.number_file import NumberFile
-from roadscan.store.codecs.parquet.page_file import DamageError
+from roadscan.store.codecs.parquet.page_file import DamageError, NumberFile
 from roadscan.store.readings.group_reader import Footer, GroupReader
 from roadscan.store.readings.kernels.firings import Packed
 from roadscan.store.readings.packed_returns import EIGHT_TO_SIXTEEN_BITS, Beams, as_returns, is_packed

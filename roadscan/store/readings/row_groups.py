@@ -1,6 +1,6 @@
 """Reads row groups of a data file as an Arrow table.
 
-What roadscan's own pages hold of profiles and returns is decoded by kernels, all else by Arrow.
+What roadscan's pages hold of profiles and returns is decoded by kernels, all else by Arrow.
 """
 
 from __future__ import annotations

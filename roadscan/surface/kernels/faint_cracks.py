@@ -318,7 +318,7 @@ def draw_strips(row, column, strips, confirmed, gain, level, share):
     """Draw the confirmed strips; where two overlap the one that gains more.
 
     gain, level, share : (rows, columns) float32, in/out: gain (0 where none), height above the ground (σ), and the
-    share of a cell in its own height.
+    share of a cell in its height.
     """
     rows, columns = gain.shape
     for t in range(row.size):

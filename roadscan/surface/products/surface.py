@@ -39,7 +39,7 @@ class SurfaceOptions(Strict):
 class Surface(SurfaceProduct):
     """One cloud-optimised GeoTIFF a tile: float32 bands, NaN where there is no surface, and overviews.
 
-    Pixels are the cells of the surface's own grid, north up, in the CRS's own unit: those whose centre lies in the
+    Pixels are the cells of the surface's grid, north up, in the CRS's unit: those whose centre lies in the
     tile. Overviews have pixels of 4 and 16 cells, while they are 32 pixels or more: the mean of the heights and
     intensities, the best of the origins.
     """

@@ -60,7 +60,7 @@ class SurfaceMesh(SurfaceProduct):
     mesh ends on the first of the next tile's: meshes of neighbours touch, and agree in their colours.
 
     With `colours = "camera"` a vertex has the colour of the picture that shows it finest: of those within
-    `camera_reach_m`, at `camera_angle_deg` or steeper, `camera_border_px` inside the picture and off the own vehicle
+    `camera_reach_m`, at `camera_angle_deg` or steeper, `camera_border_px` inside the picture and off the survey vehicle
     (`own_vehicle_px` of the rig file), the one with least distance over focal length; of equals the earliest. PLY has
     the picture's values (sRGB), glTF the linear ones that it asks for.
     """

@@ -20,9 +20,8 @@ from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.store import Store
 from roadscan.surface.reconstruction import SurfaceGrid
 from roadscan.surface.settings import SurfaceConfig
-from roadscan.surface.tasks.found_regions import FoundRegions
+from roadscan.surface.tasks.found_regions import FoundRegions, Regions, stated_regions
 from roadscan.surface.tasks.surface_colours import shown_box
-from roadscan.surface.tasks.surface_regions import Regions, stated_regions
 from roadscan.tiles.blocks import Block, cut_blocks
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.tasks.tile_files import WantedSurface, surface_file_names

@@ -35,7 +35,7 @@ from roadscan.ingest.inspect.first_survey import (
     weeks_of_overlap,
 )
 from roadscan.ingest.inspect.first_survey_text import RIG_NAME, survey_lines
-from roadscan.store.checked_json import checked_json, parse_checked
+from roadscan.store.digest import checked_json, parse_checked
 from roadscan.store.stamp import Stamp, stamp_of_info
 
 RECORDS: Final = ".arrivals"

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from roadscan.compute.kernel_options import bare, bare_inlined, bare_inner
+from roadscan.compute.kernel_options import bare, bare_inlined, bare_inner, kernel
 from roadscan.compute.kernels.column_statistics import statistics_of_64
 from roadscan.compute.kernels.height_slots import (
     COUNTS,
@@ -25,8 +26,7 @@ from roadscan.compute.kernels.slot_groups import chained_cells, open_group, put_
 from roadscan.compute.kernels.slot_statistics import slot_statistics_of_8, slot_statistics_of_28
 from roadscan.compute.kernels.store_statistics import store_group
 from roadscan.compute.kernels.streak_slots import lowest_bit
-from roadscan.tiles.kernels.cell_columns import write_statistics
-from roadscan.tiles.kernels.large_cells import select_arrays, statistics_of_full
+from roadscan.tiles.kernels.cell_columns import select_arrays, statistics_of_full, write_statistics
 from roadscan.tiles.kernels.pool import header_of, release
 
 AHEAD = 2
@@ -214,3 +214,53 @@ def finish_cells(groups, found, taken, edge, pool, floor, quantum_m, numbers, wo
         groups[group] = -1
     columns.pass_offsets[cell] = written
     return cell, written
+
+
+_BINS = 1 << 15  # Bins of the highest bits of a 32-bit number of 0 and above.
+
+
+@kernel
+def totals(count, intensity, height):
+    """Return sums over cells: points, intensities of the points, heights.
+
+    Parameters
+    ----------
+    count : (n,) uint32; intensity : (n,) float32, mean of a cell's points; height : (n,) float64.
+    """
+    points, light, high = 0, 0.0, 0.0
+    for i in range(count.size):
+        points += np.int64(count[i])
+        light += np.float64(intensity[i]) * np.float64(count[i])
+        high += height[i]
+    return points, light, high
+
+
+@kernel
+def _bins(bits, counts):
+    for i in range(bits.size):
+        counts[bits[i] >> np.uint32(16)] += 1
+
+
+@kernel
+def _within(bits, first, last, found):
+    """Collect the numbers of some bins; `found` has room for one more."""
+    n = 0
+    for i in range(bits.size):
+        own = bits[i] >> np.uint32(16)
+        found[n] = bits[i]
+        n += np.int64(own >= first) & np.int64(own <= last)
+
+
+def median(values: npt.NDArray[np.float32]) -> float:
+    """Return the median of (n ≥ 1,) float32 of 0 and above; their bits sort like the numbers, so bins are counted."""
+    bits = (values + np.float32(0.0)).view(np.uint32)
+    counts = np.zeros(_BINS, np.int64)
+    _bins(bits, counts)
+    upto = np.cumsum(counts)
+    low, high = (bits.size - 1) // 2, bits.size // 2
+    first, last = np.searchsorted(upto, (low, high), side="right")
+    found = np.empty(int(upto[last] - upto[first] + counts[first]) + 1, np.uint32)
+    _within(bits, first, last, found)
+    found = np.sort(found[:-1])
+    below = int(upto[first] - counts[first])
+    return float((found[[low - below, high - below]].view(np.float32)).mean())

@@ -1,4 +1,4 @@
-"""Buckets collect readings by row of cells until their tile is finished.
+"""Buckets collect readings by row of cells until their tile is finished; the tiles that are counted into.
 
 Successive readings of a rotating mirror or a lidar fall into distant cells: counted one by one, each reading would wait
 for its cell's memory. So readings are first put into the bucket of their row of cells in their tile: buckets grow at
@@ -282,3 +282,39 @@ def take_readings(ends, buckets, west, south, readings, passes, intensity):
             block = np.int64(before[block])
         free_row(ends[y], buckets)
         ends[y] = 0
+
+
+class ActiveTiles(NamedTuple):
+    """Active tiles in a box of tiles; each has a row in the arrays of (a, …)."""
+
+    rows: npt.NDArray[np.int32]
+    """(rows, columns) of the box: the row of each tile, −1 for tiles that are not active."""
+    corner_quanta: tuple[int, int]
+    """South-west corner of the box."""
+    cell_quanta: int
+    """Edge of a cell."""
+    edge: int
+    """Cells along a tile's edge."""
+    groups: npt.NDArray[np.int32]
+    """(a, edge · ⌈edge / 16⌉) pool element of each group of sixteen cells, −1 where it has none."""
+    ends: npt.NDArray[np.int32]
+    """(a, edge) position for the next reading in each row's bucket (``row_buckets.Buckets``)."""
+    spans: npt.NDArray[np.int64]
+    """(a, 2) first and last epoch of the readings, GPS ns; in/out."""
+    sigmas: npt.NDArray[np.float64]
+    """(a, 2) largest horizontal and vertical 1 σ of the poses (m); in/out."""
+
+
+class Measured(NamedTuple):
+    """Attributes of readings, or of profiles, besides their position."""
+
+    epochs: npt.NDArray[np.int64]
+    """(n,) GPS ns of the measurement."""
+    passes: npt.NDArray[np.int32]
+    """(n,) index of the pass among the accumulator's, −1 for none."""
+    intensity: npt.NDArray[np.unsignedinteger]
+    """(n,), for profiles (n, m)."""
+    gain: np.uint32
+    """Factor on the intensity; the product takes at most 16 bits."""
+    interval_sigmas_m: npt.NDArray[np.float64]
+    """(intervals of the trajectory, 2) largest horizontal and vertical 1 σ of the poses."""

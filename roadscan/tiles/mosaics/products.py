@@ -181,11 +181,11 @@ def _planned(
     known = [*sorted(found.summaries), *sorted(bridged)]
     outputs = product.outputs(known, options, context) if found.summaries else []
     drawn = {id(one.tiles): one.tiles for one in outputs}  # views of one sheet share them
-    told = {at: [held for tile in tiles if (held := found.contents.get(tile))] for at, tiles in drawn.items()}
+    contents = {at: [content for tile in tiles if (content := found.contents.get(tile))] for at, tiles in drawn.items()}
     for output in outputs:
         read = _read(product, files, output)
         parts = [(r.unit, r.digest, r.detail) for r in read]
-        key = key_of(own_key, output.name, told[id(output.tiles)], parts, *driven)
+        key = key_of(own_key, output.name, contents[id(output.tiles)], parts, *driven)
         yield PlannedOutput(product, options, output, key, read)
 
 
@@ -199,7 +199,7 @@ def _tasks(due: Sequence[PlannedOutput], plan: SurveyPlan, manifest: Manifest) -
     overviews = {r.unit: r for r in manifest.chosen(OVERVIEWS, units) if r.path and keys.get(r.unit) == r.key}
     tasks: list[OutputTask] = []
     for one in due:
-        own = tuple(cells[tile] for tile in one.output.tiles if tile in cells)
+        drawn = tuple(cells[tile] for tile in one.output.tiles if tile in cells)
         tasks.append(
             OutputTask(
                 plan.store,
@@ -209,8 +209,8 @@ def _tasks(due: Sequence[PlannedOutput], plan: SurveyPlan, manifest: Manifest) -
                 one.output,
                 one.key,
                 tuple(found.summaries[t] for t in sorted(one.output.tiles) if t in found.summaries),
-                own,
-                tuple(overviews[r.unit] for r in own if r.unit in overviews),
+                drawn,
+                tuple(overviews[r.unit] for r in drawn if r.unit in overviews),
                 one.read,
                 drives if one.product.needs_lanes else None,
             )

@@ -87,7 +87,7 @@ class CellDensity:
     @property
     def proposed_m(self) -> float | None:
         """Smallest edge (m) of a cell with enough readings; None where none up to a metre has."""
-        return next((edge for edge, held in self.readings.items() if held >= ENOUGH), None)
+        return next((edge for edge, readings in self.readings.items() if readings >= ENOUGH), None)
 
 
 def density_notes(survey: Survey, store: Store, manifest: Manifest) -> list[str]:
@@ -102,11 +102,11 @@ def density_notes(survey: Survey, store: Store, manifest: Manifest) -> list[str]
     stated = "cell_m" in config.model_fields_set
     if stated and found.now > 1:
         return []
-    held = f"cells of {config.cell_m:g} m hold {_readings(found.now)} each where half of all readings lie (median)"
+    sentence = f"cells of {config.cell_m:g} m hold {_readings(found.now)} each where half of all readings lie (median)"
     if found.proposed_m is None:
-        return [f"{held}; cells of {LARGEST_M:g} m would hold fewer than {ENOUGH}"]
+        return [f"{sentence}; cells of {LARGEST_M:g} m would hold fewer than {ENOUGH}"]
     default = "" if stated else " in [tiles], which states none,"
-    return [f"{held}; cell_m = {found.proposed_m:g}{default} would hold {found.readings[found.proposed_m]:g}"]
+    return [f"{sentence}; cell_m = {found.proposed_m:g}{default} would hold {found.readings[found.proposed_m]:g}"]
 
 
 def _readings(number: float) -> str:
@@ -130,8 +130,8 @@ def _fullest(summaries: Summaries) -> list[TileId]:
     if not points.size:
         return []
     order = np.argsort(-points, kind="stable")
-    held = np.cumsum(points[order])
-    half = order[: int(np.searchsorted(held, held[-1] / 2)) + 1]
+    total = np.cumsum(points[order])
+    half = order[: int(np.searchsorted(total, total[-1] / 2)) + 1]
     tiles = list(summaries)
     return [tiles[k] for k in half[np.unique(np.linspace(0, half.size - 1, _SAMPLED).round().astype(int))].tolist()]
 

@@ -15,8 +15,7 @@ from roadscan.core.strict import Strict
 from roadscan.store.codecs.cog import Image, sparse_image, write_cog
 from roadscan.store.codecs.tiff import check_cog
 from roadscan.tiles.product import ProductContext, Tile, TileProduct
-from roadscan.tiles.products.quantities import Quantity, band_of
-from roadscan.tiles.products.raster import CellBox, about
+from roadscan.tiles.products.raster import CellBox, Quantity, about, band_of
 from roadscan.tiles.pyramid import Level, pyramid_of
 
 STEPS: Final[dict[Quantity, float]] = {
@@ -43,7 +42,7 @@ class GeoTiff(TileProduct):
     """One cloud-optimised GeoTIFF a tile: float32 bands, NaN where no point lies, and overviews.
 
     The bands are the robust height (in the unit of the map's heights), the mean intensity and the number of
-    points; the standard deviation of the heights can be added. The georeference is in the CRS's own unit.
+    points; the standard deviation of the heights can be added. The georeference is in the CRS's unit.
     Overviews have pixels of 2, 8 and 32 cells, or the numbers nearest to these that divide the tile (10, 40 and
     200 mm for 10 m tiles of 5 mm cells), while they are 32 pixels or more: the mean of the cells' heights, the mean
     intensity of all points, the mean number of points a cell that holds one.

@@ -18,8 +18,7 @@ from roadscan.core.strict import Strict
 from roadscan.store.codecs.cog import Band, write_sparse_cog
 from roadscan.tiles.product import Cells, LoadCells, Output, ProductContext, SurveyProduct, TileSummary
 from roadscan.tiles.products.hillshade import SHADE_BAND, Light, base_below, shade, with_neighbours
-from roadscan.tiles.products.quantities import band_of
-from roadscan.tiles.products.raster import CellBox, about
+from roadscan.tiles.products.raster import CellBox, about, band_of
 from roadscan.tiles.products.sheets import (
     Sheet,
     check_sheet,
@@ -64,7 +63,7 @@ class Kilometre(SurveyProduct):
     ``height_40mm_553_6020.tif`` holds the heights between eastings 553 and 554 km and northings 6020 and 6021 km in
     pixels of 40 mm. Heights and intensities are float32, NaN where no point lies; the shaded relief (Horn 1981) is
     8 bits from 1 to 255, 0 where empty, and uses the neighbours' pixels, so no seam shows. Pixels are means of
-    a tile's cells. A sheet reads the overviews of its own tiles (and of those around it) one after another: time and
+    a tile's cells. A sheet reads the overviews of its tiles (and of those around it) one after another: time and
     memory do not grow with the survey, and only sheets whose tiles changed are made again.
     """
 

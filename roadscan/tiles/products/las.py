@@ -57,12 +57,12 @@ class LasOptions(Strict):
 class Las(TileProduct):
     """LAS 1.4 with point format 6 (7 where the points have colours), usually compressed to LAZ.
 
-    The CRS is stated as WKT, coordinates are in its own unit, time is adjusted standard GPS time, and
+    The CRS is stated as WKT, coordinates are in its unit, time is adjusted standard GPS time, and
     point_source_id is the pass; what a vendor's program recorded otherwise comes back unchanged (its own
     source numbers as the extra dimension ``recorded_source_id``). A variable-length record of the user
     ``roadscan`` holds JSON: survey, tile, thinning, the largest rounding errors, and a digest of the points.
 
-    A point that is kept when the others are thinned out is a recorded one, with its own position, time and
+    A point that is kept when the others are thinned out is a recorded one, with its position, time and
     pass; of several at the median height it is the first one recorded.
 
     With `filters.keep_marked` the points that filters leave out follow the others, withheld, in the classes 7, 18 and

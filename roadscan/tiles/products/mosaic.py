@@ -13,8 +13,16 @@ from roadscan.core.ids import TileId
 from roadscan.core.strict import Strict
 from roadscan.store.codecs.gdal import raster_settings
 from roadscan.tiles.product import Cells, LoadCells, Output, ProductContext, SurveyProduct, TileSummary
-from roadscan.tiles.products.quantities import QUANTITIES, Quantity, band_of, values_of
-from roadscan.tiles.products.raster import CellBox, SparseRaster, cell_image, paste_tile
+from roadscan.tiles.products.raster import (
+    QUANTITIES,
+    CellBox,
+    Quantity,
+    SparseRaster,
+    band_of,
+    cell_image,
+    paste_tile,
+    values_of,
+)
 from roadscan.tiles.products.sheets import (
     Sheet,
     cells_of,

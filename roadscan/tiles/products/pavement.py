@@ -112,7 +112,7 @@ class PavementIntensity(_Picture):
     """8-bit grey picture of the mean intensity, a pixel a cell, north up, over the part of a tile that was seen.
 
     Grey is 1 at `black` and below, 255 at `white` and above, in even steps between; 0, transparent in a PNG, is
-    empty. The world file beside it (``.pgw``, ``.bpw``) places it on the map, in the CRS's own unit.
+    empty. The world file beside it (``.pgw``, ``.bpw``) places it on the map, in the CRS's unit.
     """
 
     name: ClassVar[str] = "pavement_intensity"
@@ -135,8 +135,8 @@ class PavementShaded(_Picture):
     """8-bit shaded relief (Horn 1981) of the robust heights, a pixel a cell, as `hillshade` draws it.
 
     Values are 1 (in the shade) to 255 (facing the light); 0, transparent in a PNG, is empty. A tile's picture knows
-    its own cells alone: at its border the slope is that of its side. The world file beside it (``.pgw``, ``.bpw``)
-    places it on the map, in the CRS's own unit.
+    its cells alone: at its border the slope is that of its side. The world file beside it (``.pgw``, ``.bpw``)
+    places it on the map, in the CRS's unit.
     """
 
     name: ClassVar[str] = "pavement_shaded"

@@ -1,4 +1,4 @@
-"""Common layout of raster products: north up, in the CRS's units, as a cloud-optimised GeoTIFF."""
+"""Layout of raster products (north up, in the CRS's units, cloud-optimised GeoTIFF), and the quantities they show."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import functools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Final, Literal, Self, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -207,3 +207,34 @@ def about(
     if tile is not None:
         items.append(("ROADSCAN_TILE", str(tile)))
     return About(context.map, transform, tuple(bands), context.date, (*items, *more))
+
+
+Quantity = Literal["height", "intensity", "count", "height_std"]
+"""Robust height, mean intensity, number of points, standard deviation of the heights."""
+
+QUANTITIES: Final[tuple[Quantity, ...]] = get_args(Quantity)
+
+
+def band_of(quantity: Quantity, context: ProductContext) -> Band:
+    """Return the band that shows a quantity; heights are in the unit of the map's heights."""
+    unit = height_unit(context.map)
+    return {
+        "height": Band("height", unit),
+        "intensity": Band("intensity", "digital number"),
+        "count": Band("count", "points"),
+        "height_std": Band("height standard deviation", unit),
+    }[quantity]
+
+
+def values_of(quantity: Quantity, cells: TileCells, context: ProductContext) -> npt.NDArray[Any]:
+    """Return (n,) values of a quantity, one a cell, in the unit of its band."""
+    unit_m = context.map.vertical_unit_m
+    match quantity:
+        case "height":
+            return cells.height_robust_m / unit_m
+        case "intensity":
+            return cells.intensity_mean
+        case "count":
+            return cells.count
+        case "height_std":
+            return cells.height_std_m.astype("float64") / unit_m

@@ -46,7 +46,7 @@ class TileTable(SurveyProduct):
     """GeoParquet 1.1 of the table ``tiles`` with each tile's outline.
 
     The plain columns (metres) suffice for SQL without a spatial extension; the outline is in the map's
-    CRS and its own unit. A local frame states no CRS.
+    CRS and its unit. A local frame states no CRS.
     """
 
     name: ClassVar[str] = "tile_table"

@@ -1,4 +1,4 @@
-"""Files of a tile's cells and of their overviews: Parquet, byte planes under LZ4 by roadscan's own writer.
+"""Files of a tile's cells and of their overviews: Parquet, byte planes under LZ4 by roadscan's writer.
 
 Of 0.95 million cells of 5 mm, each of 25 readings of one pass, all columns take 20 ns of a core and 27.5 bytes a cell
 (Parquet's general writer: 60 ns and 26.8 bytes under ZSTD 1, 44 ns and 27.8 bytes under LZ4), a surface 8 ns and 5.8.

@@ -19,7 +19,7 @@ from roadscan.tiles.product import TileSummary
 from roadscan.tiles.tasks.passes_apart import FIGURE as PASSES_APART
 from roadscan.tiles.tasks.tile_plan import TILE
 
-_OF_SUMMARY = tuple(TileSummary.__dataclass_fields__)[1:]
+_OF_SUMMARY = tuple(TileSummary.__dataclass_fields__)[1:]  # All but the first, the tile.
 
 
 class Summaries(Mapping[TileId, TileSummary]):

@@ -13,8 +13,7 @@ from roadscan.core.grid import QUANTUM_M
 from roadscan.core.ids import TileId
 from roadscan.georeference.centre_line import CentreLineBuffer
 from roadscan.georeference.classes import KEPT, LAS_CLASSES, OFF_CENTRE_LINE, WITHHELD_FLAG
-from roadscan.georeference.cloud import TilePoints, fill_of
-from roadscan.georeference.order import canonical_order
+from roadscan.georeference.cloud import TilePoints, canonical_order, fill_of
 from roadscan.georeference.place import EXTRA_COLUMNS, Placed, Window, passes_of
 from roadscan.georeference.plan.centre_line import load_buffer
 from roadscan.georeference.reading_counts import ReadingCounts

@@ -20,7 +20,7 @@ from roadscan.store.records import OutputRecord, Packed, Row, table_of
 from roadscan.store.store import told_if_full
 from roadscan.tiles.blocks import Block
 from roadscan.tiles.cells import TileCells, TileEvidence
-from roadscan.tiles.kernels.cell_figures import median, totals
+from roadscan.tiles.kernels.cell_statistics import median, totals
 from roadscan.tiles.product import Tile
 from roadscan.tiles.tasks.cell_files import write_cells, write_overviews
 from roadscan.tiles.tasks.passes_apart import FIGURE as PASSES_APART

@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import BinaryIO, Final
 
-from roadscan.formats.ros.containers.compression import unpacked
 from roadscan.formats.ros.containers.storage import (
     BROKEN,
     Chunk,
@@ -21,6 +20,7 @@ from roadscan.formats.ros.containers.storage import (
     MessageSpan,
     Raw,
     exactly,
+    unpacked,
 )
 from roadscan.ingest.reading.format import Reject
 

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from typing import BinaryIO, Final
 
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.formats.ros.containers.compression import unpacked
 from roadscan.formats.ros.containers.storage import (
     BROKEN,
     Chunk,
@@ -20,6 +19,7 @@ from roadscan.formats.ros.containers.storage import (
     MessageSpan,
     Raw,
     exactly,
+    unpacked,
 )
 from roadscan.ingest.reading.format import Reject
 

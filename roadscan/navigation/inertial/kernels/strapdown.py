@@ -131,7 +131,7 @@ def strapdown_step(q, v, r, turn, push, dt, field):
     ----------
     q, v, r : attitude (ECEF from IMU), velocity (m/s, ECEF), position (m, ECEF).
     turn : rotation vector of the step, IMU axes, coning included (rad).
-    push : velocity increment of the step, IMU axes, sculling included, its own rotation not (m/s).
+    push : velocity increment of the step, IMU axes, sculling included, its rotation not (m/s).
     dt : length of the step (s); field : :func:`gravity_field` nearby.
 
     Returns

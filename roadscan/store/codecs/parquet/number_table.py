@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.store.codecs.choice import LIBRARY
-from roadscan.store.codecs.kernels.run_lengths import LONGEST_RUN_BYTES, encode_runs
+from roadscan.store.codecs.kernels.byte_planes import LONGEST_RUN_BYTES, encode_runs
 from roadscan.store.codecs.parquet import pages
 from roadscan.store.codecs.parquet.list_table import KINDS, Packed, Page, Writer, chunk
 from roadscan.store.codecs.parquet.thrift import Value, binary, i64, struct, varint, zigzag
@@ -109,7 +109,7 @@ class _Numbers(Writer):
         self._planes = np.empty(0, np.uint8)
         self._room = np.empty(0, np.uint64)
         self._epochs: tuple[Array, int, Packed] | None = None
-        """The 64-bit numbers that were packed last: a return's pose is of its own epoch mostly."""
+        """The 64-bit numbers that were packed last: a return's pose is of its epoch mostly."""
 
     def column(self, field: pa.Field, values: Array, step: float | None, stated: bool) -> Value:
         """Write a column chunk; return its part of the footer."""

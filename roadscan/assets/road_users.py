@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -49,6 +50,15 @@ _WAIST: Final = 6
 """Level above the body: 1.2 m."""
 _COLUMN_LEVELS: Final = 8
 """A cell in which so many levels are seen is one of a column: a trunk's, a hedge's; a car's sides lean."""
+_LINE_CELLS: Final = 35
+"""A straight run of so many cells (7 m) is a group of its own: fences, walls and hedges stand beside cars and touch them,
+and between two cars of a row the side that is seen has a gap."""
+_LINE_GAP: Final = 1
+"""Empty cells that do not end a line: rows of cars have wider gaps."""
+_LINE_ANGLES: Final = 72
+"""Directions of lines: a line of 7 m within 1.25° of one of them keeps to a strip of two cells."""
+_MOST_LINES, _MOST_CELLS = 6, 20_000
+"""Lines that are sought in one group, and the cells of the largest group in which they are: woods are larger."""
 _PLANAR, _LEAFY = 0.5, 0.42
 """Planarity from which a cube is one of a surface, and scattering from which it is one of leaves."""
 _BUSH_M: Final = 1.5
@@ -145,8 +155,9 @@ def groups_of(raster: Columns, moving: Bools, bodies: Bodies) -> Groups:
     """
     low = (raster.top >= 1) & (raster.top < TALL) & ~moving
     body = low & ((raster.levels & np.uint32(_BODY)) > 0)
-    count, label, boxes, _ = cv2.connectedComponentsWithStats(body.view(np.uint8), connectivity=8)
-    number = 1 + np.flatnonzero(boxes[1:count, cv2.CC_STAT_AREA] >= _LEAST_CELLS)
+    label, boxes = _parted(body)
+    count = len(boxes)
+    number = 1 + np.flatnonzero(boxes[1:, cv2.CC_STAT_AREA] >= _LEAST_CELLS)
     tall = (raster.top >= TALL) & ~moving
     beside = cv2.dilate(tall.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
     plan = [_plan_of(raster, label, int(k), _part(boxes[k], 3)) for k in number]
@@ -158,6 +169,37 @@ def groups_of(raster: Columns, moving: Bools, bodies: Bodies) -> Groups:
     }
     reached = features.pop("reached", np.zeros(0)).astype(np.int32)
     return Groups(label, number, boxes[number, :4], reached, features)
+
+
+def _parted(body: Bools) -> tuple[Int32, Int32]:
+    """Returns the group (rows, columns) of each cell of bodies, 0 of none, and the box of each: straight lines are groups
+    of their own, and so is what hangs together without them.
+    """
+    count, label, boxes, _ = cv2.connectedComponentsWithStats(body.view(np.uint8), connectivity=8)
+    cells = boxes[1:, cv2.CC_STAT_AREA]
+    # a line over the diagonal of its box has that many columns, or rows
+    is_long = boxes[1:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) >= _LINE_CELLS / math.sqrt(2.0)
+    lines = []
+    for k in 1 + np.flatnonzero(is_long & (cells >= _LINE_CELLS) & (cells <= _MOST_CELLS)):
+        left, lower, width, height = map(int, boxes[k, :4])
+        row, column = np.nonzero(label[lower : lower + height, left : left + width] == k)
+        free, x, y = np.ones(row.size, np.bool_), column.astype(np.float64), row.astype(np.float64)
+        for _ in range(_MOST_LINES):
+            line = np.zeros(row.size, np.bool_)
+            if columns.straight_run(x, y, free, _LINE_ANGLES, _LINE_GAP, line) < _LINE_CELLS:
+                break
+            free &= ~line
+            lines.append((row[line] + lower, column[line] + left))
+    if not lines:
+        return label, boxes
+    rest = body.copy()
+    for one in lines:
+        rest[one] = False
+    count, label, boxes, _ = cv2.connectedComponentsWithStats(rest.view(np.uint8), connectivity=8)
+    for number, (row, column) in enumerate(lines, count):
+        label[row, column] = number
+    of_lines = [[c.min(), r.min(), np.ptp(c) + 1, np.ptp(r) + 1, r.size] for r, c in lines]
+    return label, np.concatenate([boxes, np.array(of_lines, np.int32)])
 
 
 def _part(box: npt.NDArray[np.int32], more: int) -> tuple[slice, slice]:

@@ -11,7 +11,7 @@ from roadscan.assets.ground.grid import Grid
 from roadscan.assets.kind import asset_kinds
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.moving import Columns, load_levels, moving_cells
-from roadscan.assets.road_users import _upper_part
+from roadscan.assets.road_users import _parted, _upper_part
 from roadscan.assets.scene import Box, Scene
 from tests.assets.drives import CAR, PERSON, kitti_drive_returns
 from tests.assets.scenes import semantic_kitti_scene
@@ -44,6 +44,22 @@ def test_a_cabin_behind_a_bonnet_belongs_to_its_vehicle_and_a_plate_beside_it_do
     upper, highest = _upper_part(levels, ~body, body)
     assert np.array_equal(upper, cabin)
     assert set(highest[cabin].tolist()) == {11}
+
+
+def test_a_fence_that_touches_a_car_is_a_group_of_its_own_and_a_car_is_not_cut() -> None:
+    """Cells of 0.2 m: a fence of 9 m, which the mirror of a car touches, of which three sides are seen; a van of 4.4 m by 2 m stands for itself.
+    """
+    body = np.zeros((40, 80), np.bool_)
+    fence, car, van = (np.zeros_like(body) for _ in range(3))
+    fence[14, 5:50] = True
+    car[4:13, 10], car[4:13, 31], car[4, 10:32] = True, True, True
+    body[13, 10] = True  # a mirror
+    van[25:35, 10:32] = True
+    label, boxes = _parted(body | fence | car | van)
+    assert len(np.unique(label[fence])) == 1 and len(np.unique(label[van])) == 1
+    assert not np.isin(label[car], label[fence]).any()
+    number = int(label[14, 5])
+    assert boxes[number].tolist() in ([5, 14, 45, 1, 45], [5, 13, 45, 2, 46])  # with the mirror
 
 
 def drive(scans: slice) -> tuple[Scene, np.ndarray]:

@@ -169,17 +169,18 @@ def gains_of(samples: Sequence[IntensitySample]) -> pa.Table:
             break
     solution -= _common_part(rows, terms, (columns, values), solution)
     told = np.bincount(columns.ravel(), weights=(values.ravel() > 0.0).astype(np.float64), minlength=terms.unknowns)
+    told = told.astype(np.int64)
     alone = _without_trend(rows, terms, columns[:, 0], solution, told)
-    return _table(terms, solution, alone, np.sqrt(np.diag(covariance)), told.astype(np.int64))
+    return _table(terms, solution, alone, np.sqrt(np.diag(covariance)), told)
 
 
 def _without_trend(
-    rows: IntensitySample, terms: _Terms, laser: Int64, solution: Float64, told: Float64
+    rows: IntensitySample, terms: _Terms, laser: Int64, solution: Float64, told: Int64
 ) -> Float64:  # fmt: skip
-    """Returns the logarithmic responses (k,) of lasers without what the range at which they see the ground could explain.
+    """Returns the logarithmic responses (k,) of lasers without what the ranges of their ground could explain.
 
-    On a level road a laser sees the ground at one range alone: what is smooth over ranges may be the range's, or that of
-    the angle of incidence, which says nothing of things that stand upright. laser : (m,) the unknown of each row.
+    On a level road a laser sees the ground at one range alone: what is smooth over ranges may be that of the range, or
+    of the angle of incidence, which says nothing of things that stand upright. laser : (m,) the unknown of each row.
     """
     out = np.zeros(terms.unknowns)
     total = np.bincount(laser, weights=np.log(np.maximum(rows.range_m, RANGE_NODES_M[0])), minlength=terms.unknowns)

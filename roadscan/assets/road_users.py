@@ -51,8 +51,8 @@ _WAIST: Final = 6
 _COLUMN_LEVELS: Final = 8
 """A cell in which so many levels are seen is one of a column: a trunk's, a hedge's; a car's sides lean."""
 _LINE_CELLS: Final = 35
-"""A straight run of so many cells (7 m) is a fence, a wall or a hedge, and no part of a vehicle: between two cars of a row
-the side that is seen has a gap."""
+"""A straight run of so many cells (7 m) is a fence, a wall or a hedge, and no part of a vehicle: between two cars of a
+row the side that is seen has a gap."""
 _LINE_GAP: Final = 1
 """Empty cells that do not end a line: rows of cars have wider gaps."""
 _LINE_ANGLES: Final = 72

@@ -50,7 +50,7 @@ def test_gains_of_lasers_and_the_fall_with_range_are_found() -> None:
 
 
 def test_what_the_range_of_its_ground_could_explain_is_no_gain_of_a_laser_alone() -> None:
-    """Each laser sees the ground at its own range, between which the light falls to a fifth; one laser is twice as bright."""
+    """Each laser sees the ground at its own range, between which the light falls to a fifth; one is twice as bright."""
     rng = np.random.default_rng(4)
     place, laser = np.repeat(np.arange(900), 4), np.tile(np.arange(12), 300)
     range_m = 4.0 * 1.2**laser * rng.normal(1.0, 0.02, place.size)

@@ -47,8 +47,8 @@ def test_a_cabin_behind_a_bonnet_belongs_to_its_vehicle_and_a_plate_beside_it_do
 
 
 def test_a_fence_that_touches_a_car_is_a_line_and_no_side_of_a_car_is() -> None:
-    """Cells of 0.2 m: a fence of 9 m, which the mirror of a car touches, of which three sides are seen; a van of 4.4 m by
-    2 m touches the car.
+    """Cells of 0.2 m: a fence of 9 m, which the mirror of a car touches, of which three sides are seen; a van of 4.4 m
+    by 2 m touches the car.
     """
     fence, vehicles = np.zeros((40, 80), np.bool_), np.zeros((40, 80), np.bool_)
     fence[14, 5:50] = True

@@ -152,7 +152,8 @@ def test_the_longest_straight_run_is_the_fence_beside_two_cars(degrees: float) -
     car = np.array([(a, b) for a in np.arange(0.0, 22.0, 0.4) for b in np.arange(3.0, 11.0, 0.4)])
     turn = np.radians(degrees)
     turned = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-    cells = [np.unique(np.floor(part @ turned), axis=0) for part in (fence, np.concatenate([car, car + [26.0, 0.0]]))]
+    cars = np.concatenate([car, car + np.array([26.0, 0.0])])
+    cells = [np.unique(np.floor(part @ turned), axis=0) for part in (fence, cars)]
     x, y = np.concatenate(cells).T.copy()
     chosen, many = np.zeros(x.size, np.bool_), len(cells[0])
     assert straight_run(x, y, np.ones(x.size, np.bool_), 72, 1, chosen) == pytest.approx(45, abs=2)

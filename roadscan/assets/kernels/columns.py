@@ -102,7 +102,7 @@ def marked(x, y, above, origin, per_m, cells, lowest, highest, out):
 def straight_run(x, y, free, angles, gap, chosen):
     """Choose the longest straight run of free cells, two cells wide; returns its length in cells.
 
-    x, y : (n,) float64 column and row of each cell; free : (n,) bool; chosen : (n,) bool, set where a cell belongs to it.
+    x, y : (n,) float64 column and row of each cell; free : (n,) bool; chosen : (n,) bool, set where a cell is in it.
     angles : directions that are tried, of half a turn; gap : empty cells that do not end a run.
     """
     best, strip, first, cosine, sine, along_min, across_min = 0, 0, 0, 1.0, 0.0, 0.0, 0.0

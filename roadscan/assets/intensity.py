@@ -53,6 +53,12 @@ _EXCESS: Final = (-0.9, 2.0)  # Bounds of the excess of an intensity over its ex
 _SCATTER, _LEAST_SCATTER = 0.3, 0.02  # σ of an intensity, and its least value (shares).
 _LASER_PRIOR: Final = 0.7
 """Prior 1 σ of a laser's logarithmic gain."""
+_LEAST_LASERS: Final = 6
+"""The trend over ranges is a parabola; of fewer lasers nothing is left that it could not explain."""
+_ITS_OWN, _TREND_ROUNDS = 0.2, 5
+"""A logarithmic gain so far off the trend has a quarter of its weight; rounds of weighing."""
+_DOUBT_PLACES: Final = 30.0
+"""Places that speak as much for a laser's gain as a gain of 1 does: what one place reflects differs within it."""
 _LEVEL_PRIOR: Final = 0.3
 """Prior 1 σ of the logarithmic gains of range and of incidence, as a root mean square over their nodes: on a level road
 both show the same trend, and a sum of two large ones would pass on the noise of the normals."""
@@ -163,7 +169,31 @@ def gains_of(samples: Sequence[IntensitySample]) -> pa.Table:
             break
     solution -= _common_part(rows, terms, (columns, values), solution)
     told = np.bincount(columns.ravel(), weights=(values.ravel() > 0.0).astype(np.float64), minlength=terms.unknowns)
-    return _table(terms, solution, np.sqrt(np.diag(covariance)), told.astype(np.int64))
+    told = told.astype(np.int64)
+    alone = _without_trend(rows, terms, columns[:, 0], solution, told)
+    return _table(terms, solution, alone, np.sqrt(np.diag(covariance)), told)
+
+
+def _without_trend(
+    rows: IntensitySample, terms: _Terms, laser: Int64, solution: Float64, told: Int64
+) -> Float64:  # fmt: skip
+    """Returns the logarithmic responses (k,) of lasers without what the ranges of their ground could explain.
+
+    On a level road a laser sees the ground at one range alone: what is smooth over ranges may be that of the range, or
+    of the angle of incidence, which says nothing of things that stand upright. laser : (m,) the unknown of each row.
+    """
+    out = np.zeros(terms.unknowns)
+    total = np.bincount(laser, weights=np.log(np.maximum(rows.range_m, RANGE_NODES_M[0])), minlength=terms.unknowns)
+    for lasers, first in zip(terms.lasers, terms.first, strict=True):
+        own = slice(first, first + lasers.size)
+        if lasers.size >= _LEAST_LASERS:
+            u, weight = total[own] / told[own], told[own] / (told[own] + _DOUBT_PLACES)
+            past = np.zeros(lasers.size)
+            for _ in range(_TREND_ROUNDS):
+                trend = np.polyfit(u - u.mean(), solution[own], 2, w=np.sqrt(weight) / (1.0 + (past / _ITS_OWN) ** 2))
+                past = solution[own] - np.polyval(trend, u - u.mean())
+            out[own] = weight * past
+    return out
 
 
 def light_of(samples: Sequence[IntensitySample], gains: pa.Table) -> float | None:
@@ -220,12 +250,12 @@ def calibrated(returns: Returns, ground: GroundModel, gains: pa.Table) -> Return
     nodes_of = log_gains_by_node(gains)
     for number, name in enumerate(returns.sensors):
         mine = returns.sensor == number
-        lasers, of_laser = nodes_of(name, "laser")
+        (lasers, of_laser), (_, alone) = nodes_of(name, "laser"), nodes_of(name, "laser alone")
         if not mine.any() or not lasers.size:
             continue
-        by_laser = np.zeros(int(np.iinfo(np.uint16).max) + 1)
-        by_laser[lasers.astype(np.int64)] = of_laser
-        of_lasers[mine] = by_laser[returns.laser[mine]] - float(np.median(of_laser))
+        by_laser, by_laser_alone = np.zeros((2, int(np.iinfo(np.uint16).max) + 1))
+        by_laser[lasers.astype(np.int64)], by_laser_alone[lasers.astype(np.int64)] = of_laser, alone
+        of_lasers[mine] = by_laser_alone[returns.laser[mine]]
         log_gains(mine, returns.laser, range_m, incidence, on_ground, by_laser,
                   nodes_of(name, "range"), nodes_of(name, "incidence"), log_gain)  # fmt: skip
     log_gain[np.isnan(log_gain)] = 0.0  # the sensor's place is not known
@@ -444,7 +474,7 @@ def _common_part(rows: IntensitySample, terms: _Terms, design: tuple[Int64, Floa
     return out
 
 
-def _table(terms: _Terms, solution: Float64, sigma: Float64, told: Int64) -> pa.Table:
+def _table(terms: _Terms, solution: Float64, alone: Float64, sigma: Float64, told: Int64) -> pa.Table:
     rows: list[tuple[str, str, float, float, float, int]] = []
     for name, lasers, first in zip(terms.sensors, terms.lasers, terms.first, strict=True):
         if not lasers.size:
@@ -457,6 +487,9 @@ def _table(terms: _Terms, solution: Float64, sigma: Float64, told: Int64) -> pa.
         ):
             for i, node in enumerate(nodes, start):
                 rows.append((name, term, float(node), float(np.exp(-solution[i])), float(sigma[i]), int(told[i])))
+                if term == "laser":
+                    gain = float(np.exp(-alone[i]))
+                    rows.append((name, "laser alone", float(node), gain, float(sigma[i]), int(told[i])))
             start += len(nodes)
     rows.sort(key=lambda r: r[:3])
     columns = [pa.array(c, f.type) for c, f in zip(zip(*rows, strict=True), GAINS_SCHEMA, strict=True)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -49,6 +50,15 @@ _WAIST: Final = 6
 """Level above the body: 1.2 m."""
 _COLUMN_LEVELS: Final = 8
 """A cell in which so many levels are seen is one of a column: a trunk's, a hedge's; a car's sides lean."""
+_LINE_CELLS: Final = 35
+"""A straight run of so many cells (7 m) is a fence, a wall or a hedge, and no part of a vehicle: between two cars of a
+row the side that is seen has a gap."""
+_LINE_GAP: Final = 1
+"""Empty cells that do not end a line: rows of cars have wider gaps."""
+_LINE_ANGLES: Final = 72
+"""Directions of lines: a line of 7 m within 1.25° of one of them keeps to a strip of two cells."""
+_MOST_LINES, _MOST_CELLS = 6, 20_000
+"""Most lines of one group, and cells of the largest group in which they are sought: woods are larger."""
 _PLANAR, _LEAFY = 0.5, 0.42
 """Planarity from which a cube is one of a surface, and scattering from which it is one of leaves."""
 _BUSH_M: Final = 1.5
@@ -104,13 +114,17 @@ def road_users(
 
 
 def parked_cells(raster: Columns, moving: Bools, bodies: Bodies) -> Int32:
-    """Returns the level of parked vehicles, in their cells (rows, columns); 0 elsewhere."""
+    """Returns the level of parked vehicles, in their cells (rows, columns); 0 elsewhere.
+
+    What stands beside cars may touch them: a vehicle with a straight line is judged once more without it, part by part.
+    """
     groups = groups_of(raster, moving, bodies)
+    is_vehicle = _are_vehicles(groups)
+    lines = straight_lines(groups, is_vehicle)
+    if lines.any():
+        groups = groups_of(raster, moving, bodies, lines)
+        is_vehicle = _are_vehicles(groups)
     found = np.zeros(raster.top.shape, np.int32)
-    if not groups.number.size:
-        return found
-    is_bush = (groups.features["scattering"] > _LEAFY) & (groups.features["length_m"] > _BUSH_M)
-    is_vehicle = VEHICLE.probability(groups.features) >= np.where(is_bush, _LEAST_LEAFY, _LEAST)
     for k in np.flatnonzero(is_vehicle).tolist():
         part = _part(groups.boxes[k], 3)
         label, reached = groups.label[part], int(groups.reached[k])
@@ -122,6 +136,32 @@ def parked_cells(raster: Columns, moving: Bools, bodies: Bodies) -> Int32:
         upper, highest = _upper_part(raster.levels[part], label == 0, wider)
         found[part][upper] = np.maximum(found[part][upper], highest[upper] + 1)
     return found
+
+
+def _are_vehicles(groups: Groups) -> Bools:
+    """Returns which groups (k,) are vehicles."""
+    if not groups.number.size:
+        return np.zeros(0, np.bool_)
+    is_bush = (groups.features["scattering"] > _LEAFY) & (groups.features["length_m"] > _BUSH_M)
+    return VEHICLE.probability(groups.features) >= np.where(is_bush, _LEAST_LEAFY, _LEAST)
+
+
+def straight_lines(groups: Groups, which: Bools) -> Bools:
+    """Returns a mask (rows, columns) of the straight lines in some of the groups; which : (k,)."""
+    out = np.zeros(groups.label.shape, np.bool_)
+    # a line over the diagonal of its box has that many columns, or rows
+    is_long = groups.boxes[:, 2:].max(axis=1, initial=0) >= _LINE_CELLS / math.sqrt(2.0)
+    for k in np.flatnonzero(which & is_long).tolist():
+        part = _part(groups.boxes[k], 0)
+        row, column = np.nonzero(groups.label[part] == groups.number[k])
+        free, x, y = np.ones(row.size, np.bool_), column.astype(np.float64), row.astype(np.float64)
+        for _ in range(_MOST_LINES if row.size <= _MOST_CELLS else 0):
+            line = np.zeros(row.size, np.bool_)
+            if columns.straight_run(x, y, free, _LINE_ANGLES, _LINE_GAP, line) < _LINE_CELLS:
+                break
+            free &= ~line
+        out[part][row[~free], column[~free]] = True
+    return out
 
 
 def _upper_part(levels: npt.NDArray[np.uint32], free: Bools, body: Bools) -> tuple[Bools, Int32]:
@@ -138,14 +178,17 @@ def _upper_part(levels: npt.NDArray[np.uint32], free: Bools, body: Bools) -> tup
     return np.isin(label, [k for k in touching if min(sides_m(label == k)) >= _CABIN_M]), highest
 
 
-def groups_of(raster: Columns, moving: Bools, bodies: Bodies) -> Groups:
+def groups_of(raster: Columns, moving: Bools, bodies: Bodies, apart: Bools | None = None) -> Groups:
     """Returns the groups of a window, with their features: lengths in metres, shares of cells and of returns.
 
-    None of them counts returns, so that they mean the same for any scanner and any number of passes.
+    None of them counts returns, so that they mean the same for any scanner and any number of passes. Cells that are set
+    apart (rows, columns) belong to none.
     """
     low = (raster.top >= 1) & (raster.top < TALL) & ~moving
     body = low & ((raster.levels & np.uint32(_BODY)) > 0)
-    count, label, boxes, _ = cv2.connectedComponentsWithStats(body.view(np.uint8), connectivity=8)
+    held = body if apart is None else body & ~apart
+    count, label, boxes, _ = cv2.connectedComponentsWithStats(held.view(np.uint8), connectivity=8)
+    label[body & ~held] = count
     number = 1 + np.flatnonzero(boxes[1:count, cv2.CC_STAT_AREA] >= _LEAST_CELLS)
     tall = (raster.top >= TALL) & ~moving
     beside = cv2.dilate(tall.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
@@ -154,7 +197,7 @@ def groups_of(raster: Columns, moving: Bools, bodies: Bodies) -> Groups:
     area = boxes[number, cv2.CC_STAT_AREA].astype(np.float64)
     features["tall_beside"] = np.bincount(label[beside], minlength=count)[number] / area
     features |= {
-        name: values[number] for name, values in _scatter(label.astype(np.int32), raster, bodies, count).items()
+        name: values[number] for name, values in _scatter(label.astype(np.int32), raster, bodies, count + 1).items()
     }
     reached = features.pop("reached", np.zeros(0)).astype(np.int32)
     return Groups(label, number, boxes[number, :4], reached, features)

@@ -49,6 +49,22 @@ def test_gains_of_lasers_and_the_fall_with_range_are_found() -> None:
     assert abs(fall / np.exp((10.0 - 32.0) / 40.0) - 1.0) < 0.2
 
 
+def test_what_the_range_of_its_ground_could_explain_is_no_gain_of_a_laser_alone() -> None:
+    """Each laser sees the ground at its own range, between which the light falls to a fifth; one is twice as bright."""
+    rng = np.random.default_rng(4)
+    place, laser = np.repeat(np.arange(900), 4), np.tile(np.arange(12), 300)
+    range_m = 4.0 * 1.2**laser * rng.normal(1.0, 0.02, place.size)
+    true = rng.uniform(20.0, 60.0, 900)[place] * (1.0 + (laser == 7)) * (range_m / 4.0) ** -0.8
+    found = IntensitySample(
+        (0.0, 0.0), ("lidar",), place, np.zeros_like(place), laser, range_m,
+        np.degrees(np.arccos(1.8 / range_m)), true * rng.normal(1.0, 0.1, place.size), np.full(place.size, 3), 0.01,
+    )  # fmt: skip
+    rows = gains_of([found]).to_pandas()
+    alone = rows[rows.term == "laser alone"].sort_values("node").gain.to_numpy()
+    assert abs(alone[7] / np.median(np.delete(alone, 7)) / 0.5 - 1.0) < 0.2
+    assert np.delete(alone, 7).max() / np.delete(alone, 7).min() < 1.4  # 3.5 of the light that came back
+
+
 def test_gains_are_the_same_for_any_order_of_the_samples_and_fit_their_table() -> None:
     samples = [sample(k, 10.0 * k)[0] for k in range(3)]
     one, other = gains_of(samples), gains_of(samples[::-1])

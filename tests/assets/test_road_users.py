@@ -11,7 +11,7 @@ from roadscan.assets.ground.grid import Grid
 from roadscan.assets.kind import asset_kinds
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.moving import Columns, load_levels, moving_cells
-from roadscan.assets.road_users import _upper_part
+from roadscan.assets.road_users import Groups, _upper_part, straight_lines
 from roadscan.assets.scene import Box, Scene
 from tests.assets.drives import CAR, PERSON, kitti_drive_returns
 from tests.assets.scenes import semantic_kitti_scene
@@ -44,6 +44,22 @@ def test_a_cabin_behind_a_bonnet_belongs_to_its_vehicle_and_a_plate_beside_it_do
     upper, highest = _upper_part(levels, ~body, body)
     assert np.array_equal(upper, cabin)
     assert set(highest[cabin].tolist()) == {11}
+
+
+def test_a_fence_that_touches_a_car_is_a_line_and_no_side_of_a_car_is() -> None:
+    """Cells of 0.2 m: a fence of 9 m, which the mirror of a car touches, of which three sides are seen; a van of 4.4 m
+    by 2 m touches the car.
+    """
+    fence, vehicles = np.zeros((40, 80), np.bool_), np.zeros((40, 80), np.bool_)
+    fence[14, 5:50] = True
+    vehicles[4:13, 10], vehicles[4:13, 31], vehicles[4, 10:32], vehicles[25:35, 32:54] = True, True, True, True
+    vehicles[13, 10] = vehicles[12:25, 31] = True
+    label, box = (fence | vehicles).astype(np.int32), np.array([[5, 4, 49, 31]], np.int32)
+    lines = straight_lines(Groups(label, np.array([1]), box, np.zeros(1, np.int32), {}), np.ones(1, np.bool_))
+    assert lines[fence].all() and np.count_nonzero(lines & vehicles & ~fence) <= 3  # what touches it
+    vehicles[14, 31] = False
+    alone = Groups(vehicles.astype(np.int32), np.array([1]), box, np.zeros(1, np.int32), {})
+    assert not straight_lines(alone, np.ones(1, np.bool_)).any()
 
 
 def drive(scans: slice) -> tuple[Scene, np.ndarray]:

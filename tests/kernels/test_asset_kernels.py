@@ -8,7 +8,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.stats import binned_statistic_2d
 
 from roadscan.assets.kernels import voxels
-from roadscan.assets.kernels.columns import columns, distinct, marked, tops
+from roadscan.assets.kernels.columns import columns, distinct, marked, straight_run, tops
 from roadscan.assets.kernels.filling import begin, halved, relax
 from roadscan.assets.kernels.ground_cells import cell_heights, on_ground, scatter
 from roadscan.assets.kernels.heights import heights_above
@@ -142,6 +142,23 @@ def test_marked_returns() -> None:
     out = np.empty(5, np.int32)
     marked(x, y, above, np.zeros(2), 1.0, cells, np.array([0.0, 0.0, 2.0]), np.array([9.0, 2.0, 4.0]), out)
     assert out.tolist() == [0, 1, 0, 2, 0]
+
+
+@pytest.mark.parametrize("degrees", [0.0, 17.0, 45.0, 90.0, 131.3])
+def test_the_longest_straight_run_is_the_fence_beside_two_cars(degrees: float) -> None:
+    """A fence of 45 cells with a cell missing, and beside it two cars of 22 cells with 4 cells between them."""
+    step = np.arange(0.0, 45.0, 0.1)
+    fence = np.column_stack([step, np.zeros(step.size)])[(step < 20.0) | (step > 21.0)]
+    car = np.array([(a, b) for a in np.arange(0.0, 22.0, 0.4) for b in np.arange(3.0, 11.0, 0.4)])
+    turn = np.radians(degrees)
+    turned = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    cars = np.concatenate([car, car + np.array([26.0, 0.0])])
+    cells = [np.unique(np.floor(part @ turned), axis=0) for part in (fence, cars)]
+    x, y = np.concatenate(cells).T.copy()
+    chosen, many = np.zeros(x.size, np.bool_), len(cells[0])
+    assert straight_run(x, y, np.ones(x.size, np.bool_), 72, 1, chosen) == pytest.approx(45, abs=2)
+    assert chosen[:many].mean() > 0.9 and not chosen[many:].any()
+    assert straight_run(x, y, ~chosen, 72, 1, np.zeros(x.size, np.bool_)) < 30
 
 
 def test_features_of_cubes_are_those_of_the_covariance_of_27_cubes() -> None:

@@ -96,3 +96,43 @@ def marked(x, y, above, origin, per_m, cells, lowest, highest, out):
             at = cells[i, j]
             if at > 0 and lowest[at] <= above[k] <= highest[at]:
                 out[k] = at
+
+
+@kernel
+def straight_run(x, y, free, angles, gap, chosen):
+    """Choose the longest straight run of free cells, two cells wide; returns its length in cells.
+
+    x, y : (n,) float64 column and row of each cell; free : (n,) bool; chosen : (n,) bool, set where a cell is in it.
+    angles : directions that are tried, of half a turn; gap : empty cells that do not end a run.
+    """
+    best, strip, first, cosine, sine, along_min, across_min = 0, 0, 0, 1.0, 0.0, 0.0, 0.0
+    for k in range(angles):
+        c, s = math.cos(math.pi * k / angles), math.sin(math.pi * k / angles)
+        a0, a1, o0, o1 = math.inf, -math.inf, math.inf, -math.inf
+        for i in range(x.size):
+            if free[i]:
+                a, o = x[i] * c + y[i] * s, y[i] * c - x[i] * s
+                a0, a1, o0, o1 = min(a0, a), max(a1, a), min(o0, o), max(o1, o)
+        if not a1 - a0 >= best:
+            continue
+        held = np.zeros((int(o1 - o0) + 3, int(a1 - a0) + 2), np.bool_)
+        for i in range(x.size):
+            if free[i]:
+                at, beside = int(x[i] * c + y[i] * s - a0 + 0.5), int(y[i] * c - x[i] * s - o0 + 0.5)
+                held[beside, at] = held[beside + 1, at] = True
+        for o in range(held.shape[0]):
+            last, begin = -gap - 2, 0
+            for a in range(held.shape[1]):
+                if held[o, a]:
+                    if a - last > gap + 1:
+                        begin = a
+                    last = a
+                    if a - begin + 1 > best:
+                        best, strip, first = a - begin + 1, o, begin
+                        cosine, sine, along_min, across_min = c, s, a0, o0
+    for i in range(x.size):
+        if free[i]:
+            at = int(x[i] * cosine + y[i] * sine - along_min + 0.5)
+            beside = int(y[i] * cosine - x[i] * sine - across_min + 0.5)
+            chosen[i] = beside <= strip <= beside + 1 and first <= at < first + best
+    return best

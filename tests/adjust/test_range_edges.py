@@ -5,6 +5,7 @@ Pictures and returns are cast here, ray by ray, onto boxes on a road; nothing of
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import itertools
 
@@ -15,14 +16,17 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
 from roadscan.adjust.adjustment import adjust
-from roadscan.adjust.bundle.edge_boresight import EdgeBoresight, Sighted, boresight_of, edge_observations
-from roadscan.adjust.bundle.range_edges import EdgeScores, scores_of
+from roadscan.adjust.bundle.edge_boresight import EdgeBoresight, Sighted, boresight_of, edge_observations, widened
+from roadscan.adjust.bundle.range_edges import OTHERS, EdgeScores, scores_of
+from roadscan.adjust.bundle.solve import approached
 from roadscan.adjust.kernels.range_edges import continued, scores_of_turns
+from roadscan.adjust.observations import Observations
 from roadscan.adjust.process import CameraPrior, GaussMarkov, MountingPrior, RunPrior
 from roadscan.adjust.solver_settings import AdjustmentSettings
 from roadscan.adjust.tasks.edge_scores import boresight_findings
 from roadscan.core.camera import Interior
 from roadscan.pictures.views import Lens
+from tests.adjust.test_bundle import BORESIGHT_RAD, Block, simulated_drive
 
 Float64 = npt.NDArray[np.float64]
 
@@ -126,6 +130,46 @@ def test_the_adjustment_takes_what_edges_say(found: EdgeBoresight) -> None:
     assert (np.abs(left) < 0.15).all()
     sigma = solved.mountings.sigma[0, 3:6]
     assert sigma == pytest.approx(found.sigma, rel=0.1)
+
+
+def test_an_assumed_sigma_does_not_hold_a_boresight_back(found: EdgeBoresight) -> None:
+    stated = (MountingPrior("camera", np.array([*[0.02] * 3, *np.radians([0.5, 0.0, 2.0]), 0.0])),)
+    assert widened(stated, [found]) == stated
+    assumed = dataclasses.replace(found, of=dataclasses.replace(found.of, is_assumed=True))
+    wider = widened(stated, [assumed])[0].sigma
+    turn = np.abs(np.degrees(found.turn))
+    assert np.degrees(wider[3:6]) == pytest.approx([turn[0], 0.0, 2.0])  # what is not estimated stays so
+    assert (wider[:3] == 0.02).all()
+
+
+@pytest.mark.parametrize("drift", [0.0, 0.012])
+def test_tie_points_that_bend_the_lever_arm_with_the_boresight_count_less(drift: float) -> None:
+    """Recorded places drift sideways by a share of the way: tie points take that for a heading of the camera."""
+    sigma = (*[0.02] * 3, *np.radians([0.01] * 3).tolist())
+    drive = simulated_drive(5, block=Block(tau_s=120.0, pose_sigma=sigma))
+    own = drive.evidence.measured
+    aside = drift * np.arange(len(own.exposures))[:, None] * own.exposures.world_from_body[:, :, 1]
+    exposures = dataclasses.replace(own.exposures, body_world_m=own.exposures.body_world_m + aside)
+    moved = np.zeros((3, OTHERS))
+    moved[2, 1] = np.radians(-7.0)  # a lever arm to the right looks like a turn to the left, as of things 8 m away
+    sighted = Sighted("left", "lidar", 0, -1, -1, AXES, np.radians([0.5] * 3))
+    # The axes of their covariance are none of the body, so that each of the three rows tells a part alone.
+    mixed = Rotation.from_rotvec([0.6, 0.6, 0.6]).as_matrix()
+    covariance = (mixed * np.radians([0.05, 0.06, 0.07]) ** 2) @ mixed.T
+    edges = EdgeBoresight(sighted, 9, 9_000, BORESIGHT_RAD, covariance, moved, "")
+    evidence = dataclasses.replace(
+        drive.evidence, measured=dataclasses.replace(own, exposures=exposures), enters=own.is_tie, edges=(edges,)
+    )
+    mounts, beside = (
+        (MountingPrior("left", np.array([*[0.02] * 3, *np.radians([0.5] * 3), 0.0])),),
+        edge_observations([edges]),
+    )
+    way = approached(evidence, (beside, 0), (drive.prior,), AdjustmentSettings(), mounts)
+    assert (way.against_edges > 3.0) == (drift > 0.0)
+    joined = Observations.joined([beside, way.rows.observations])
+    solved = adjust(joined, (drive.prior,), AdjustmentSettings(), mounts, evidence.cameras).mountings
+    off, known = np.degrees(solved.error[0, 3:6] - BORESIGHT_RAD), np.degrees(solved.sigma[0, 3:6])
+    assert (np.abs(off) < 2.5 * known).all() and np.abs(off).max() < 0.15
 
 
 @pytest.mark.witness("picture_edges")

@@ -8,7 +8,7 @@ dependent (Newey & West 1987). Where another turn is as good, or the sum is flat
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from roadscan.adjust.bundle.range_edges import OTHERS, TURNS_DEG, EdgeScores
 from roadscan.adjust.observations import CAMERA, COMPONENTS, FIXED, KINDS, MOUNTED, Observations
+from roadscan.adjust.process import MountingPrior
 from roadscan.compute.array_types import Float64
 from roadscan.pictures.lens import PARAMETERS
 
@@ -51,6 +52,8 @@ class Sighted:
     """(3, 3) of the camera, as stated."""
     stated_sigma_rad: Float64
     """(3,) 1 σ of the stated boresight about the axes of the body; 0 where it is not estimated."""
+    is_assumed: bool = False
+    """True where the rig file states no such σ."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +71,11 @@ class EdgeBoresight:
     """(3, 18) what lever arms, the lidar's mounting and the lens add to that turn when they are off: `OTHERS`."""
     why_not: str
     """Why it does not count; "" where it does."""
+
+    @property
+    def counts(self) -> bool:
+        """Returns whether it is an observation of the adjustment."""
+        return not self.why_not and self.of.camera_seat >= 0
 
     @property
     def sigma(self) -> Float64:
@@ -180,7 +188,7 @@ def edge_observations(found: Sequence[EdgeBoresight]) -> Observations:
     """Returns three observations of each boresight that counts: turns about the axes of its covariance (rad)."""
     parts = []
     for number, one in enumerate(found):
-        if one.why_not or one.of.camera_seat < 0:
+        if not one.counts:
             continue
         values, vectors = np.linalg.eigh(one.covariance)
         seats = np.zeros((3, 2, len(MOUNTED)))
@@ -199,3 +207,17 @@ def edge_observations(found: Sequence[EdgeBoresight]) -> Observations:
             )
         )  # fmt: skip
     return Observations.joined(parts)
+
+
+def widened(priors: Sequence[MountingPrior], found: Sequence[EdgeBoresight]) -> tuple[MountingPrior, ...]:
+    """Returns priors of mountings whose σ of a boresight, where the rig file states none, is at least the turn that
+    edges show: an assumption would hold it back.
+    """
+    wider = list(priors)
+    for one in found:
+        if one.counts and one.of.is_assumed:
+            own = wider[one.of.camera_seat]
+            sigma = own.sigma.copy()
+            sigma[3:6] = np.where(sigma[3:6] > 0.0, np.maximum(sigma[3:6], np.abs(one.turn)), 0.0)
+            wider[one.of.camera_seat] = replace(own, sigma=sigma)
+    return tuple(wider)

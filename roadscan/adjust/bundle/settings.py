@@ -17,7 +17,7 @@ class CameraPriors(Strict):
     sigma_lever_m: float = Field(default=0.02, ge=0.0, le=1.0)
     """1 σ of the lever arm on each axis (m)."""
     sigma_boresight_deg: float = Field(default=0.5, ge=0.0, le=10.0)
-    """1 σ of the boresight about each axis (degrees)."""
+    """1 σ of the boresight about each axis (degrees); where range edges show a larger turn, that turn."""
     sigma_focal: float = Field(default=0.003, ge=0.0, le=0.1)
     """1 σ of the focal length, as a share of it."""
     sigma_principal: float = Field(default=0.001, ge=0.0, le=0.1)

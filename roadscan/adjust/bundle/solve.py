@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from roadscan.adjust.adjustment import Adjustment, adjust
+from roadscan.adjust.adjustment import Adjustment, MountingErrors, adjust
 from roadscan.adjust.bundle.depths import DepthRows, NearReturns, Surfaces, depth_rows, surfaces_of
 from roadscan.adjust.bundle.edge_boresight import KIND, EdgeBoresight
 from roadscan.adjust.bundle.measurements import (
@@ -52,7 +52,9 @@ _ELSEWHERE_M: Final = 0.5
 """A tie point farther than this from a surface that the lidar saw there (m) is of something that moves …"""
 _ELSEWHERE: Final = 6.0  # … if that is so many σ as well.
 _CONTRADICTS: Final = 3.0
-"""Range edges contradict tie points beyond so many σ."""
+"""Range edges, or the stated lever arm beside them, contradict tie points beyond so many σ."""
+_TOLD: Final = 0.5
+"""A lever arm is judged where observations take away this share of its stated σ (as variances add up) or more."""
 _SOFTER: Final = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
 """Factors of what the tie points of a picture are off in common that are tried then, until 1 σ is left."""
 _LEAST_SHARED_PX: Final = 0.01
@@ -85,7 +87,7 @@ class PictureEvidence:
 
     def at_start(self) -> State:
         """Returns the state from which solutions begin: cameras turned as range edges show them."""
-        told = [one for one in reversed(self.edges) if not one.why_not and one.of.camera_seat >= 0]
+        told = [one for one in reversed(self.edges) if one.counts]
         return State(mountings={one.of.camera_seat: np.array([0.0, 0.0, 0.0, *one.turn, 0.0]) for one in told})
 
 
@@ -205,11 +207,12 @@ def approached(
 def _shared(
     pictures: PictureEvidence, parts: tuple[Observations, Rows, Float64], solved: Callable[[Observations], Adjustment]
 ) -> tuple[float, float]:
-    """Returns 1 σ (px) of what the tie points of a picture are off in common, and by how many σ range edges contradict
-    them as it is stated, 0 where they do not.
+    """Returns 1 σ (px) of what the tie points of a picture are off in common, and by how many σ range edges, or the
+    stated lever arm beside them, contradict them as it is stated, 0 where they do not.
 
     Edges hold whatever moves, and whatever the poses; tie points do not. So where the two contradict, tie points are
-    off in common by more than is stated.
+    off in common by more than is stated. Edges see a boresight and a lever arm that are off together as one: tie points
+    of things that move bend both of them so that edges agree, and then the lever arm is not the stated one.
 
     Parameters
     ----------
@@ -217,15 +220,28 @@ def _shared(
     """
     beside, rows, weight = parts
     edges, first = np.flatnonzero(beside.kind == KINDS.index(KIND)), 0.0
+    seats = [one.of.camera_seat for one in pictures.edges if one.counts]
     for factor in _SOFTER if edges.size else ():
         softer = replace(pictures, shared_px=max(pictures.shared_px, _LEAST_SHARED_PX) * factor)
-        joined = Observations.joined([beside, sharing(rows, softer, weight).observations])
-        off = float(np.nan_to_num(np.abs(solved(joined).normalised_residual[edges])).max())
-        first = first or off
+        found = solved(Observations.joined([beside, sharing(rows, softer, weight).observations]))
+        off = np.append(
+            np.nan_to_num(np.abs(found.normalised_residual[edges])), _off_lever(found.mountings, seats)
+        ).max()
+        first = first or float(off)
         if off <= (_CONTRADICTS if factor == 1.0 else 1.0):
             break
     contradicted = first > _CONTRADICTS
     return (softer.shared_px, first) if contradicted else (pictures.shared_px, 0.0)
+
+
+def _off_lever(found: MountingErrors, seats: Sequence[int]) -> Float64:
+    """Returns by how many σ all observations contradict the stated lever arms of some sensors, axis by axis; 0 where
+    they hardly tell it.
+    """
+    error, sigma, stated = (own[seats, :3].ravel() for own in (found.error, found.sigma, found.prior_sigma))
+    learnt = np.sqrt(np.maximum(stated**2 - sigma**2, 0.0))
+    told = learnt > _TOLD * stated
+    return np.where(told, np.abs(error) / np.where(told, learnt, 1.0), 0.0)
 
 
 def _depths(

@@ -174,8 +174,9 @@ def picture_findings(found: PictureOutcome | None) -> list[Finding]:
     edges = boresight_findings(found.edges)
     if found.against_edges:
         said = (
-            f"range edges of lidars contradict tie points by {found.against_edges:.1f} σ: these are of things that "
-            "move, or the poses are off by more than is stated; tie points count as if those of a picture were off by "
+            "range edges of lidars, or the stated lever arm of the camera beside them, contradict tie points by "
+            f"{found.against_edges:.1f} σ: these are of things that move, the poses are off by more than is stated, or "
+            "the lever arm is; tie points count as if those of a picture were off by "
             f"{found.shared_px:.2g} px in common"
         )
         edges.append(PICTURE_FIT.finds("pictures", said))

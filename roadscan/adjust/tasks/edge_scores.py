@@ -150,7 +150,7 @@ def load_boresights(
         sigma = camera_sigma(plan.survey.rig.sensors[camera_name], priors)[0][3:6]
         sighted = Sighted(
             camera_name, lidar, seat, lidar_seat, int(numbers.camera[int(exposure.camera[0])]),
-            exposure.body_from_opencv[0], sigma,
+            exposure.body_from_opencv[0], sigma, plan.survey.rig.sensors[camera_name].boresight_sigma_deg is None,
         )  # fmt: skip
         scores = [one for task in own for one in _loaded(manifest, task, plan.store)]
         found.append(boresight_of(sighted, scores, float(np.radians(priors.sigma_shared_edge_deg))))
@@ -175,7 +175,7 @@ def boresight_rows(found: Sequence[EdgeBoresight]) -> list[dict[str, Any]]:
         told = bool(one.edges) and bool(one.covariance.any())
         row: dict[str, Any] = {
             "sensor": one.of.camera, "lidar": one.of.lidar, "pictures": one.pictures, "edges": one.edges,
-            "used": int(not one.why_not and one.of.camera_seat >= 0), "why_not": one.why_not or None,
+            "used": int(one.counts), "why_not": one.why_not or None,
         }  # fmt: skip
         for k, axis in enumerate(_AXES):
             row[f"{axis}_deg"] = float(np.degrees(one.turn[k])) if told else None

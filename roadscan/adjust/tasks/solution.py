@@ -9,7 +9,7 @@ from typing import Final, Literal
 import numpy as np
 
 from roadscan.adjust.adjustment import Adjustment, CameraErrors, CommonErrors, ControlErrors, MountingErrors, adjust
-from roadscan.adjust.bundle.edge_boresight import edge_observations
+from roadscan.adjust.bundle.edge_boresight import edge_observations, widened
 from roadscan.adjust.bundle.outcome import PictureOutcome, outcome_of
 from roadscan.adjust.bundle.self_check import FreeCameras, free_cameras
 from roadscan.adjust.bundle.solve import Approached, PictureEvidence, approached
@@ -301,6 +301,7 @@ def _adjusted(
     priors, cameras, approach = evidence.mounted.priors, list[CameraPrior](), None
     if evidence.pictures is not None and mode == "joint":
         joined = Observations.joined([joined, edge_observations(evidence.pictures.edges)])
+        priors = widened(priors, evidence.pictures.edges)
         approach = approached(evidence.pictures, (joined, first), evidence.priors, settings, priors)
         more = [] if approach.depths is None else [approach.depths.observations]
         joined = Observations.joined([joined, *more, approach.rows.observations])

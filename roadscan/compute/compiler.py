@@ -24,7 +24,16 @@ from typing import Any, TypeVar, cast
 import numba
 
 from roadscan.compute import numba_internals
-from roadscan.compute.numba_internals import CACHES, KNOWN, PART, compiler_lock, host_features, host_name, options
+from roadscan.compute.numba_internals import (
+    CACHES,
+    KNOWN,
+    PART,
+    compiler_lock,
+    forget,
+    host_features,
+    host_name,
+    options,
+)
 from roadscan.core.private_folder import check_private, make_private
 
 try:
@@ -103,6 +112,9 @@ def _compile_once(dispatcher: Any, folder: str, *, counted: bool) -> None:
             with _locked(path):
                 inside = True
                 try:
+                    entry = compile_now(signature)
+                except (ImportError, AttributeError):  # the cache names the class of an argument where it no longer is
+                    forget(dispatcher)
                     entry = compile_now(signature)
                 finally:
                     inside = False

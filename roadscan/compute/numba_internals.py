@@ -36,12 +36,19 @@ __all__ = [
     "PART",
     "cgutils",
     "compiler_lock",
+    "forget",
     "host_features",
     "host_name",
     "ir",
     "options",
     "types",
 ]
+
+
+def forget(function: Any) -> None:
+    """Empty the cache of a compiled function; it cannot be read where it names what has moved or is gone."""
+    function._cache.flush()
+
 
 KNOWN = numba.__version__.startswith("0.68.")
 """Whether the internals of this Numba are those that were read."""

@@ -20,7 +20,6 @@ from roadscan.store.records import OutputRecord, Packed, Row, table_of
 from roadscan.store.store import told_if_full
 from roadscan.tiles.blocks import Block
 from roadscan.tiles.cells import TileCells, TileEvidence
-from roadscan.tiles.kernels.cell_statistics import median, totals
 from roadscan.tiles.product import Tile
 from roadscan.tiles.tasks.cell_files import write_cells, write_overviews
 from roadscan.tiles.tasks.passes_apart import FIGURE as PASSES_APART
@@ -182,6 +181,8 @@ def _write_tile(task: TileTask, key: str, content: Tile, evidence: TileEvidence,
 
 
 def _figures(cells: TileCells, evidence: TileEvidence) -> dict[str, Any]:
+    from roadscan.tiles.kernels.cell_statistics import median, totals  # loads Numba, which `status` does without
+
     points, light, heights_m = totals(cells.count, cells.intensity_mean, cells.height_robust_m)
     lone = cells.pass_ids.size > 0 and cells.pass_ids.min() == cells.pass_ids.max()
     return {

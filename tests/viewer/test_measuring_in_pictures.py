@@ -282,12 +282,13 @@ def test_two_pictures_give_a_place_and_the_second_shows_the_ray_of_the_first(yar
         # The yellow line passes the target: its poses are off by what all pictures share.
         x, y = in_picture(page, true[1])
         box = page.locator(".picture-frame").bounding_box()
-        marks = "document.querySelector('.picture-marks').getContext('2d')"
-        around = f"[...{marks}.getImageData(x - 6, y - 6, 13, 13).data]"
-        yellow = (
-            f"([x, y]) => {around}.some((v, k, all) => k % 4 == 0 && v > 200 && all[k + 1] > 150 && all[k + 2] < 120)"
-        )
-        page.wait_for_function(yellow, arg=[x - box["x"], y - box["y"]])  # it is drawn in a later frame
+        # Its pixels are those of the room that the picture had when they were drawn; the room may since be lower.
+        marks = "document.querySelector('.picture-marks')"
+        at = f"(x * {marks}.width / width - 6, y * {marks}.height / height - 6, 13, 13)"
+        around = f"[...{marks}.getContext('2d').getImageData{at}.data]"
+        is_yellow = "(v, k, all) => k % 4 == 0 && v > 200 && all[k + 1] > 150 && all[k + 2] < 120"
+        yellow = f"([x, y, width, height]) => {around}.some({is_yellow})"
+        page.wait_for_function(yellow, arg=[x - box["x"], y - box["y"], box["width"], box["height"]])  # a frame later
         page.mouse.click(x, y)
         figure = page.locator(".figure", has_text="Place by two pictures")
         figure.wait_for()

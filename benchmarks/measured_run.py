@@ -178,7 +178,8 @@ def _limit(pid: int, share: float) -> None:
     group.mkdir()
     period_us = int((group / "cpu.cfs_period_us").read_text())
     (group / "cpu.cfs_quota_us").write_text(f"{round(share * period_us)}")
-    (group / "cgroup.procs").write_text(f"{pid}")
+    with contextlib.suppress(ProcessLookupError):  # it has just ended
+        (group / "cgroup.procs").write_text(f"{pid}")
 
 
 def _peak_rss(process: psutil.Process) -> int:

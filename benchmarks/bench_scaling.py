@@ -18,7 +18,7 @@ def figures(folder: Path) -> Iterator[Figure]:
     lengths = [float(km) for km in size.scaling_km.split(",")]
     repeats = max(1, size.repeats // 2)
     spacing_m = size.scaling_spacing_mm / 1e3
-    measured_runs(surveys.pair(kept, max(20.0, 20 * spacing_m), spacing_m), folder, 1, repeats=1)  # compiles
+    measured_runs(surveys.short_pair(kept, spacing_m), folder, 1, repeats=1)  # compiles
     ones: dict[float, Runs] = {}
     for workers in (1, 2):
         first: Runs | None = None

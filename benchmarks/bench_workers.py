@@ -19,7 +19,7 @@ def figures(folder: Path) -> Iterator[Figure]:
     """Wall time of one worker over that of several, each with the same share of a core."""
     size, kept = Settings.current(), bench_folder(folder)
     spacing_m = size.scaling_spacing_mm / 1e3
-    measured_runs(surveys.pair(kept, max(20.0, 20 * spacing_m), spacing_m), folder, 1, repeats=1)  # compiles
+    measured_runs(surveys.short_pair(kept, spacing_m), folder, 1, repeats=1)  # compiles
     survey = surveys.pair(kept, 1000 * size.workers_km, spacing_m)
     one: Runs | None = None
     for workers in (1, 2, 4, 8):

@@ -152,6 +152,8 @@ class _Watch(threading.Thread):
         """End it."""
         self._over.set()
         self.join()
+        if self._share:
+            _remove_groups()
 
     def peaks_mb(self) -> tuple[float, float]:
         """Peak of the first process, and of the worker that took most (MiB; of the first where there is none)."""
@@ -170,16 +172,20 @@ class _Watch(threading.Thread):
 
 
 def _limit(pid: int, share: float) -> None:
-    """Give a process this share of a core, by a control group (version 1) of its own; groups that are empty go."""
-    for old in _GROUPS.glob("roadscan-bench-*"):
-        with contextlib.suppress(OSError):  # its process is at work
-            old.rmdir()
+    """Give a process this share of a core, by a control group (version 1)."""
     group = _GROUPS / f"roadscan-bench-{pid}"
     group.mkdir()
     period_us = int((group / "cpu.cfs_period_us").read_text())
     (group / "cpu.cfs_quota_us").write_text(f"{round(share * period_us)}")
     with contextlib.suppress(ProcessLookupError):  # it has just ended
         (group / "cgroup.procs").write_text(f"{pid}")
+
+
+def _remove_groups() -> None:
+    """Remove the groups of processes that have ended."""
+    for group in _GROUPS.glob("roadscan-bench-*"):
+        with contextlib.suppress(OSError):  # its process is at work
+            group.rmdir()
 
 
 def _peak_rss(process: psutil.Process) -> int:

@@ -50,6 +50,11 @@ class BenchSurvey:
     raw_bytes: int
 
 
+def short_pair(folder: Path, spacing_m: float) -> BenchSurvey:
+    """A drive of the pair that compiles and loads what a longer one needs."""
+    return pair(folder, max(20.0, 20 * spacing_m), spacing_m)
+
+
 def pair(folder: Path, length_m: float = 250.0, spacing_m: float = LINE_SPACING_M) -> BenchSurvey:
     """Two laser-triangulation heads over a lane of 4 m: together 28,000 profiles/s of 4,000 readings at 100 km/h.
 

@@ -470,7 +470,10 @@ def known_format(name: str) -> LogFormat | None:
 
 
 def format_alone(name: str) -> LogFormat:
-    """Return a format by name as :func:`format_named` does, without importing the others where it is known."""
+    """Return a format by name as :func:`format_named` does, without importing the others where it is known.
+
+    It stands beside that one because calibrations are keyed by the code of that one, and would be computed anew.
+    """
     return known_format(name) or format_named(name)
 
 

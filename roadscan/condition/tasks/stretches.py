@@ -125,7 +125,8 @@ def _on_the_way(
         station = np.array([station[0], station[0] + 1.0]) if station.size else np.array([from_m, from_m + 1.0])
     at = station - line.first_m
     nodes = np.arange(len(line.nodes_m))
-    # By NumPy, since `status` asks, too, and would load Numba for it: to a tenth of a millimetre as `line.places`.
+    # By NumPy, since `status` would load Numba for `line.places`. At the ends of a line, on a bend of 30 m and 5 m
+    # beside it, the two differ by 83 mm, which the 0.2 m below cover; elsewhere by nothing.
     along, across = (np.interp(at, nodes, change) for change in np.gradient(line.nodes_m, axis=0).T)
     beside = lane.offsets(station) / np.hypot(along, across)
     east, north = (np.interp(at, nodes, coordinate) for coordinate in line.nodes_m.T)

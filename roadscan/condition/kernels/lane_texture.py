@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from roadscan.compute.kernel_options import inlined, inner, kernel
-from roadscan.condition.kernels.sampling import MOST_CELLS, Cells, factorise, gather, solve
+from roadscan.condition.kernels.sampling import MOST_CELLS, Cells, factorise, gather, median, smallest, solve
 
 BLOCK_M = 0.05
 """Edge of a block, at least that of a cell (m)."""
@@ -62,10 +62,12 @@ def bent_slopes(found, count, base, half, sums, blocks, slopes):
     the surface, the slope is that of the plane, in the last row. slopes : (blocks² + 1, 2).
     """
     last = blocks * blocks
+    all_fitted = True
     for b in range(last):
         if sums[b, N] < FITTED:
             slopes[b, 0], slopes[b, 1] = slopes[last, 0], slopes[last, 1]
-    if count < ENOUGH_BENT or sums[:last, N].min() >= FITTED:
+            all_fitted = False
+    if count < ENOUGH_BENT or all_fitted:
         return
     normal, factor = np.zeros((BENT, BENT)), np.zeros((BENT, BENT))
     right, terms, surface = np.zeros(BENT), np.zeros(BENT), np.zeros(BENT)
@@ -109,7 +111,7 @@ def block_scatter(sums, b, slopes, cell_m):
     return between, within
 
 
-@kernel
+@inner
 def peaks(found, count, base, half, pitch, lattice, out):
     """Write the mean profile depth of the lines along a square (m), and the variance of their heights (m²).
 
@@ -189,13 +191,13 @@ def fill_blocks(found, count, base, half, blocks, sums):
                 sums[b, FREEDOM] += found.readings[k] - 1.0
 
 
-@kernel
+@inner
 def loss(found, count, base, half, blocks, sums, slopes, away):
     """Return the mean depth of a square's cells below its undamaged surface (m), each from the plane of its block.
 
     NaN with fewer than four cells a block. away : (count,) room.
     """
-    used = 0
+    used, total = 0, 0.0
     for k in range(count):
         i = min(max(int((found.along[k] + 1.0) * 0.5 * blocks), 0), blocks - 1)
         j = min(max(int((found.across[k] + 1.0) * 0.5 * blocks), 0), blocks - 1)
@@ -206,11 +208,11 @@ def loss(found, count, base, half, blocks, sums, slopes, away):
         x, y = found.along[k] * half, found.across[k] * half
         level = sums[b, H] / n + slopes[b, 0] * (x - sums[b, X] / n) + slopes[b, 1] * (y - sums[b, Y] / n)
         away[used] = found.height[k] - base - level
+        total += away[used]
         used += 1
     if used < 4 * blocks * blocks:
         return np.nan
-    place = int(SOUND * used)
-    return np.partition(away[:used], place)[place] - np.mean(away[:used])
+    return smallest(away[:used], int(SOUND * used)) - total / used
 
 
 @kernel
@@ -277,7 +279,7 @@ def texture_of_squares(table, places, edge_m, out):
             known += 1
         if 2 * known < blocks * blocks:
             continue
-        out[i, TEXTURE] = math.sqrt(np.median(variance[:known]))
+        out[i, TEXTURE] = math.sqrt(median(variance[:known]))
         out[i, LOSS] = loss(found, count, base, half, blocks, sums, slopes, away)
         _, within = block_scatter(sums, blocks * blocks, slopes, cell)
         out[i, WITHIN] = 0.0 if np.isnan(within) else within * hidden

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.compute.kernel_options import inlined, kernel
+from roadscan.compute.kernel_options import inlined, inner, kernel
 
 MOST_CELLS = 4096
 """Most cells of a window that are used; of a denser window those of its first rows."""
@@ -67,6 +67,44 @@ class Cells(NamedTuple):
     readings: npt.NDArray[np.float64]
     at: npt.NDArray[np.int64]
     """Their indices in the table."""
+
+
+@inner
+def smallest(values, k):
+    """Return the k-th smallest (from 0) of (n,) float64, which change places (Hoare, 1961, algorithm 65).
+
+    NumPy's median and partition compile for a second in each kernel that calls them.
+    """
+    low, high = 0, values.size - 1
+    while low < high:
+        pivot, i, j = values[k], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while pivot < values[j]:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if j < k:
+            low = i
+        if k < i:
+            high = j
+    return values[k]
+
+
+@inner
+def median(values):
+    """Return the median of (n,) float64, n > 0, which change places."""
+    half = values.size // 2
+    high = smallest(values, half)
+    if values.size % 2 == 1:
+        return high
+    low = values[0]
+    for k in range(1, half):
+        low = max(low, values[k])
+    return (low + high) / 2.0
 
 
 @inlined
@@ -175,7 +213,7 @@ def solve(factor, size, right, out):
         out[i] = value / factor[i, i]
 
 
-@kernel
+@inner
 def fit(found, count, wanted, base, out):
     """Fit a local surface to the cells of a window; return the number of terms that are determined.
 
@@ -202,7 +240,7 @@ def fit(found, count, wanted, base, out):
     return size
 
 
-@kernel
+@inner
 def residuals(found, count, base, surface, out):
     """Compute distances of a window's cells from a fitted surface, out (count,) float64 (m)."""
     terms = np.zeros(TERMS)
@@ -214,7 +252,7 @@ def residuals(found, count, base, surface, out):
         out[k] = value
 
 
-@kernel
+@inner
 def sigma(found, count, size, away, told):
     """Return the standard deviation of the height in the middle (m), from the scatter of cells about a surface.
 
@@ -277,7 +315,7 @@ def sample(table, places, half_along, half_across, bend, out):
     """
     room = np.empty((6, MOST_CELLS))
     found = Cells(room[0], room[1], room[2], room[3], room[4], room[5], np.empty(MOST_CELLS, np.int64))
-    surface, away = np.zeros(TERMS), np.empty(MOST_CELLS)
+    surface, away, work = np.zeros(TERMS), np.empty(MOST_CELLS), np.empty(MOST_CELLS)
     wanted = 4 if bend else 3
     window = 4.0 * half_along * half_across / (table.cell[0] * table.cell[1])
     stride = max(int(math.sqrt(window / ENOUGH_CELLS)), 1)
@@ -287,14 +325,16 @@ def sample(table, places, half_along, half_across, bend, out):
         out[i, 2] = min(count * stride * stride / window, 1.0)
         if count < 3 or not central(found, count):
             continue
-        base = np.median(found.height[:count])
+        for k in range(count):
+            work[k] = found.height[k]
+        base = median(work[:count])
         for k in range(count):
             away[k] = found.height[k] - base
-        leave_out(found, count, away, GROSS_M)
+        leave_out(found, count, away, GROSS_M, work)
         if fit(found, count, wanted, base, surface) < 3:
             continue
         residuals(found, count, base, surface, away)
-        leave_out(found, count, away, LEAST_SCALE_M)
+        leave_out(found, count, away, LEAST_SCALE_M, work)
         size = fit(found, count, wanted, base, surface)
         if size < 3:
             continue
@@ -316,10 +356,12 @@ def central(found, count):
     return total > 0.0 and abs(s) < 0.35 * total and abs(o) < 0.35 * total
 
 
-@inlined
-def leave_out(found, count, away, least):
+@inner
+def leave_out(found, count, away, least, work):
     """Set the weight of cells far from the surface to 0; median distances count as at least `least` (m)."""
-    scale = max(np.median(np.abs(away[:count])), least)
+    for k in range(count):
+        work[k] = abs(away[k])
+    scale = max(median(work[:count]), least)
     for k in range(count):
         if abs(away[k]) > OUTLIER * scale:
             found.weight[k] = 0.0

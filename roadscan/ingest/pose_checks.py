@@ -7,6 +7,7 @@ are kept until then, and stored in no table.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -80,8 +81,10 @@ POSES, FIXES = "trajectory", "gnss"
 """Tables whose positions are checked."""
 _NOUN: Final = {POSES: "pose", FIXES: "GNSS position"}
 _GNSS_VELOCITY: Final = ("velocity_north_m_per_s", "velocity_east_m_per_s", "velocity_down_m_per_s")
+_BLOCK: Final = 100_000
+"""Most poses that are examined together: each takes about 500 bytes while links between poses are judged."""
 _BESIDE: Final = 4_000
-"""Poses of the files before and after that are examined together with those of a file."""
+"""Poses of the blocks before and after that are examined together with those of a block."""
 _NO_FIX_SHARE: Final = 0.5
 """If more poses lie at latitude 0, longitude 0, it is the place of the survey (a simulated one)."""
 _NAMED: Final = 3
@@ -284,14 +287,22 @@ class _Reading(NamedTuple):
 
 
 def _judged(writer: LogWriter, table: str, reading: _Reading) -> Iterator[tuple[Int64, Leaps, Int64]]:
-    """Yield the result of :func:`_judge` for each file of poses, with the poses of the files before and after it."""
+    """Yield the result of :func:`_judge` for each block of poses, with the poses of the blocks before and after it."""
     window: list[pa.Table] = []
-    for rows in [*writer.tables(table), None]:
+    for rows in itertools.chain(_blocks(writer, table), [None]):
         if len(window) > 0:
             before = [one.slice(max(one.num_rows - _BESIDE, 0)) for one in window[:-1]]
             after = [] if rows is None else [rows.slice(0, _BESIDE)]
             yield _judge(window[-1], pa.concat_tables([*before, window[-1], *after]), reading)
         window = [*window[-1:], *([] if rows is None else [rows])]
+
+
+def _blocks(writer: LogWriter, table: str) -> Iterator[pa.Table]:
+    """Yield the rows of each file of a table, in blocks of nearly the same size."""
+    for rows in writer.tables(table):
+        count = -(-rows.num_rows // _BLOCK)
+        ends = [rows.num_rows * k // count for k in range(count + 1)]
+        yield from (rows.slice(first, end - first) for first, end in itertools.pairwise(ends))
 
 
 def _judge(own: pa.Table, rows: pa.Table, reading: _Reading) -> tuple[Int64, Leaps, Int64]:

@@ -136,8 +136,14 @@ def test_one_wrong_pose_is_left_out_and_readings_lie_where_they_belong(
     assert why.split(",")[0] in (folder / "store/survey=s/report/report.html").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_drawn_bursts_are_left_out_by_record(survey: Path, seed: int) -> None:
+@pytest.mark.parametrize(
+    ("seed", "block"), [*((seed, 100_000) for seed in range(8)), *((seed, 60) for seed in range(8))]
+)
+def test_drawn_bursts_are_left_out_by_record(
+    survey: Path, monkeypatch: pytest.MonkeyPatch, seed: int, block: int
+) -> None:
+    """Poses of a long log are examined in blocks; here also in four."""
+    monkeypatch.setattr("roadscan.ingest.pose_checks._BLOCK", block)
     rng = np.random.default_rng(seed)
     poses, count = mended(survey), int(rng.choice([1, 2, 5, 20]))
     at = int(rng.choice([0, 201 - count])) if seed % 2 and count <= 5 else int(rng.integers(25, 150))

@@ -22,10 +22,9 @@ from roadscan.ingest.reading.poses import GeodeticPlacement, PoseReader, RawPose
 from roadscan.ingest.reading.records import EpochReader, Sieve, few_rejects, options_of
 from roadscan.ingest.reading.text_table import Kind, TextBlock, TextLayout, head_of, line_blocks, parse_lines
 
-# `#NAME,port,sequence,idle,time status,week,seconds,…;fields*crc` or, with a short header,
-# `%NAME,week,seconds;fields*crc`.
-# The CRC-32 has the polynomial 0xEDB88320, starts at 0, is not inverted at its end, and covers what stands between the
-# `#` or `%` and the `*` (NovAtel, OEM7 documentation, "32-bit CRC").
+# `#NAME,port,sequence,idle,time status,week,seconds,…;fields*crc`; a short header is `%NAME,week,seconds;`. The CRC-32
+# has the polynomial 0xEDB88320, starts at 0, is not inverted at its end, and covers what stands between the `#` or `%`
+# and the `*` (NovAtel, OEM7 documentation, "32-bit CRC").
 FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
     "INSPVAXA": (
         "status", "type", "latitude", "longitude", "above_sea", "undulation", "north", "east", "up", "roll", "pitch",

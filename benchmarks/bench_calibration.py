@@ -16,8 +16,7 @@ from roadscan.calibrate.stop_and_go import HeadRun, find_orientation
 from roadscan.core.crs import world_from_geodetic
 from roadscan.core.frames import ENU_FROM_NED, ecef_from_ned, quaternion_from_rotation, rotation_from_rph
 from roadscan.core.gpstime import NS_PER_S, WEEK_S
-from roadscan.core.imu import IMU_GRADES
-from roadscan.core.rig import Mounting, Rig
+from roadscan.core.rig import IMU_GRADES, Mounting, Rig
 from roadscan.navigation.inertial.readings import ImuReadings
 from roadscan.poses.trajectory import Trajectory
 from roadscan.simulate import Scene, simulate

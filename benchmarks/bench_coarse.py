@@ -21,9 +21,8 @@ from benchmarks.timing import Figure
 from roadscan.core.grid import Bounds, TileGrid
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.core.settings.segmentation import SegmentationConfig
-from roadscan.georeference.segmentation import segmented
-from roadscan.surface.coarse import CoarseModel, CoarseSettings, Stretch, coarse_model
-from roadscan.surface.regions import RegionSettings, find_regions
+from roadscan.georeference.road_profiles import segmented
+from roadscan.surface.regions import CoarseModel, CoarseSettings, RegionSettings, Stretch, coarse_model, find_regions
 
 LENGTH_M, SPEED_M_PER_S = 1000.0, 50.0 / 3.6
 PIECE_M = 100.0

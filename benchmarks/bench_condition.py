@@ -17,11 +17,10 @@ from scipy.linalg import expm
 from benchmarks.bench_lanes import RoughSurvey, rough_scene
 from benchmarks.timing import Figure, thread_seconds
 from roadscan.condition.kernels.quarter_car import roll
-from roadscan.condition.profiles.quarter_car import GOLDEN_CAR, RULES, SPEED_M_PER_S
+from roadscan.condition.profiles.profiles import GOLDEN_CAR, RULES, SPEED_M_PER_S
 from roadscan.condition.profiles.ride import ride
-from roadscan.condition.profiles.spectrum import road_spectrum
-from roadscan.condition.profiles.straightedge import straightedge_mm
 from roadscan.condition.profiles.texture import texture_segments
+from roadscan.condition.profiles.unevenness import road_spectrum, straightedge_mm
 
 SAMPLES = 1_000_000
 PLAIN_SAMPLES = 20_000

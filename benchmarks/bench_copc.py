@@ -10,8 +10,7 @@ import numpy as np
 
 from benchmarks.timing import Figure
 from roadscan.core.crs import MapFrame
-from roadscan.core.grid import QUANTA_PER_M, TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import QUANTA_PER_M, TileGrid, TileId
 from roadscan.georeference.cloud import TilePoints
 from roadscan.site.cloud_file import PointSpool, write_cloud
 from roadscan.tiles.products.cloud_records import Lattice

@@ -21,8 +21,8 @@ from roadscan.surface.clough_tocher import cubic_surface
 from roadscan.surface.normals import slopes_at
 from roadscan.surface.reconstruction import DetailedSettings, detailed_surface
 from roadscan.surface.sites import sites
+from roadscan.surface.tile import GridWindow
 from roadscan.surface.triangulation import triangulate
-from roadscan.surface.window import GridWindow
 from tests.surface.test_detailed import franke
 
 ORIGIN = np.array([431_000.0, 5_400_000.0, 0.0])

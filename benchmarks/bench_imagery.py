@@ -39,8 +39,8 @@ from roadscan.assets.statistics import Statistics
 from roadscan.assets.tasks.load_returns import load_squares, scene_of
 from roadscan.assets.tasks.plan import asset_grid, readings_of
 from roadscan.assets.tasks.work import plan_evidence
-from roadscan.colours.cameras import cameras_of
 from roadscan.colours.kernels.looks import Limits, look, project
+from roadscan.colours.painting import cameras_of
 from roadscan.colours.tasks.share import Shares
 from roadscan.colours.tasks.work import plan_work
 from roadscan.core.grid import Bounds

@@ -18,12 +18,12 @@ import pyogrio
 import shapely
 
 from benchmarks.timing import Figure
+from roadscan.inventory.found_distresses import Unknown
 from roadscan.inventory.home import Home
 from roadscan.inventory.homes.geopackage import GeoPackage
 from roadscan.inventory.inventory import Inventory
 from roadscan.inventory.of_survey import ADDRESS
 from roadscan.inventory.recording import Found, Rules
-from roadscan.inventory.visibility import Unknown
 from roadscan.store.asset_schema import asset_schema
 from roadscan.store.asset_truth import AssetTruth
 from roadscan.store.store import Store

@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from benchmarks.timing import Figure, best_seconds
 from roadscan.core.crs import MapFrame, world_from_geodetic
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileGrid, TileId
 from roadscan.core.rig import Mountings, Sensor
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.georeference.charts import charts_along

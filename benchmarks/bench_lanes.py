@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from benchmarks.timing import Figure
 from roadscan.condition.settings import ConditionConfig
-from roadscan.condition.tasks.against_truth import Compared, compared_values
+from roadscan.condition.tasks.compare import Compared, compared_values
 from roadscan.core.strict import load_toml
 from roadscan.core.survey import Survey
 from roadscan.run.session import Session, manifest_of

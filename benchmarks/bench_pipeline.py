@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from benchmarks.timing import Figure
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.core.survey import Survey
 from roadscan.demo.demo import summarise
 from roadscan.run.engine.compute import Inline

@@ -19,9 +19,8 @@ from scipy.ndimage import gaussian_filter
 
 from benchmarks.timing import Figure, thread_seconds
 from roadscan.core.crs import MapFrame
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import TileId
-from roadscan.store.codecs.gdal import raster_crs, raster_settings
+from roadscan.core.grid import TileGrid, TileId
+from roadscan.store.codecs.tiff import raster_crs, raster_settings
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.product import ProductContext, Tile
 from roadscan.tiles.products.geotiff import GeoTiff, GeoTiffOptions

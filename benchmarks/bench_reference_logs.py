@@ -32,7 +32,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.bench_reference_site import BARS, REPEATABILITY_MM, SITE, pose_covariance, survey_covariance
 from benchmarks.settings import Settings
 from benchmarks.timing import Figure
-from roadscan.adjust.control.control import Sighting
+from roadscan.adjust.control import Sighting
 from roadscan.adjust.observations import KINDS, Observations
 from roadscan.adjust.tasks import adjustment
 from roadscan.adjust.tasks.solution import Evidence, Solution
@@ -43,7 +43,7 @@ from roadscan.run.engine.compute_on import compute_on
 from roadscan.run.session import Reporter, Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, simulate, truth
-from roadscan.simulate.earth import Earth
+from roadscan.simulate.path import Earth
 from roadscan.store.query.sql import query
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages

@@ -9,9 +9,8 @@ import numpy as np
 from scipy.interpolate import LinearNDInterpolator
 
 from benchmarks.timing import Figure, thread_seconds
-from roadscan.condition.natural_neighbour import interpolate
-from roadscan.condition.roughness_regions.points import RoadPoints, pyramid
-from roadscan.condition.roughness_regions.regions import find_regions
+from roadscan.condition.roughness_rasters import RoadPoints, interpolate, pyramid
+from roadscan.condition.roughness_regions import find_regions
 from roadscan.condition.settings import RoughnessRegionsConfig
 
 POINTS, CELL_M, SHAPE = 100_000, 0.06, (500, 167)

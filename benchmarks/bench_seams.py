@@ -28,7 +28,7 @@ from roadscan.run.engine.compute_on import compute_on
 from roadscan.run.session import Reporter, Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, simulate, truth
-from roadscan.simulate.earth import Earth
+from roadscan.simulate.path import Earth
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 

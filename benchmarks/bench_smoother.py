@@ -11,8 +11,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from benchmarks.timing import Figure
-from roadscan.core.imu import ImuGrade
-from roadscan.core.settings.smoothing import SmootherConfig
+from roadscan.core.rig import ImuGrade
+from roadscan.core.settings.navigation import SmootherConfig
 from roadscan.navigation.inertial.adaptive import solve_adaptively
 from roadscan.navigation.inertial.readings import Solution
 from roadscan.navigation.inertial.smoother import solve

@@ -26,10 +26,9 @@ from benchmarks.calibration_yard import (
 from benchmarks.timing import Figure
 from roadscan.calibrate.estimator import Calibration, calibrate
 from roadscan.calibrate.evidence import Evidence, Orientation
-from roadscan.calibrate.surfaces.heads import HeadTies, agreement
 from roadscan.calibrate.surfaces.heights import HeightTies
-from roadscan.calibrate.surfaces.planes import PlaneTies
-from roadscan.calibrate.surfaces.readings import level_from_world, placed
+from roadscan.calibrate.surfaces.objects import HeadTies, agreement
+from roadscan.calibrate.surfaces.planes import PlaneTies, level_from_world, placed
 from roadscan.calibrate.unknowns import Estimate
 from roadscan.core.settings.calibration import CalibrationSettings
 

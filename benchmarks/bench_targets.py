@@ -31,10 +31,9 @@ from benchmarks.painted_targets import (
     painted_sample,
 )
 from benchmarks.timing import Figure
+from roadscan.adjust.settings import TargetSettings
 from roadscan.adjust.targets.find import find_target
-from roadscan.adjust.targets.settings import TargetSettings
-from roadscan.adjust.targets.shapes import Chequered, Shape
-from roadscan.adjust.targets.values import TargetFind
+from roadscan.adjust.targets.shapes import Chequered, Shape, TargetFind
 
 Float64 = npt.NDArray[np.float64]
 

@@ -14,17 +14,16 @@ from scipy.spatial.transform import Rotation
 from benchmarks.bench_calibration import head_runs
 from roadscan.calibrate.evidence import Orientation, Traverse
 from roadscan.calibrate.stop_and_go import find_orientation
-from roadscan.calibrate.surfaces.readings import Pieces, Readings
+from roadscan.calibrate.surfaces.planes import Pieces, Readings
 from roadscan.calibrate.unknowns import Prior, mounting_of
-from roadscan.core.imu import IMU_GRADES
-from roadscan.core.rig import Mounting, Rig
+from roadscan.core.rig import IMU_GRADES, Mounting, Rig
 from roadscan.poses.trajectory import Trajectory
 from roadscan.simulate import Scene, simulate
 from roadscan.simulate.caster import World, ray_key
 from roadscan.simulate.drive import Drive, drives_of
-from roadscan.simulate.earth import Earth
 from roadscan.simulate.lidar_model import lidar_model
 from roadscan.simulate.noise import GaussMarkov, stream
+from roadscan.simulate.path import Earth
 from roadscan.simulate.scene import Mount
 from roadscan.simulate.sensors import lidar, profiler
 from roadscan.simulate.surface import Surface

@@ -32,9 +32,9 @@ from roadscan.simulate import Scene
 from roadscan.simulate.bodies import CLASSES, class_number, class_of_kind
 from roadscan.simulate.caster import World
 from roadscan.simulate.drive import Drive, Poses, drives_of
-from roadscan.simulate.earth import Earth, LocalMap
 from roadscan.simulate.kernels.ground import kerb_heights
 from roadscan.simulate.kernels.road import KERB_TOP_M, find_paint
+from roadscan.simulate.path import Earth, LocalMap
 from roadscan.simulate.sensors.lidar import BODY_FROM_AXES, Packets, beam_width_deg, measure
 from roadscan.simulate.surface import Surface
 from roadscan.simulate.things import objects_table

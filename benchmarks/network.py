@@ -16,8 +16,7 @@ import numpy.typing as npt
 
 from benchmarks.course import CRS, START_GPS_NS
 from benchmarks.surveys import LINE_SPACING_M, LINE_SPEED_M_PER_S
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import LanePass, PassId, RunId
+from roadscan.core.grid import LanePass, PassId, RunId, TileGrid
 from roadscan.core.rig import Mountings, Sensor
 from roadscan.core.survey import Survey
 from roadscan.footprints.footprints import FootprintRanges

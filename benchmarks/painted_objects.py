@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.core.gpstime import ADJUSTED_OFFSET_S, NS_PER_S
 from roadscan.simulate import Scene, simulate, truth
-from roadscan.simulate.earth import Earth
+from roadscan.simulate.path import Earth
 from roadscan.simulate.sensors import camera as simulated_camera
 from roadscan.simulate.sensors.picture import Studio, _Eye
 

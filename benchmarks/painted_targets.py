@@ -15,8 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from roadscan.adjust.targets.shapes import Disc, Shape
-from roadscan.adjust.targets.values import ExpectedTarget, TargetReadings
+from roadscan.adjust.targets.shapes import Disc, ExpectedTarget, Shape, TargetReadings
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
 

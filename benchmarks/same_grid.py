@@ -19,8 +19,7 @@ import rasterio
 
 from benchmarks.skilled_user import Cells, Points, to_cells
 from benchmarks.timing import Figure, best_seconds
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileGrid, TileId
 from roadscan.georeference.cloud import TilePoints
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.statistics import cells_of

@@ -23,8 +23,7 @@ from benchmarks.course import CRS, GEODETIC, START_S, WEEK, Course
 from benchmarks.network import HEADS, TILE_M, Drive
 from benchmarks.pavement import write_scans
 from benchmarks.surveys import LINE_SPEED_M_PER_S
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileGrid, TileId
 from roadscan.core.survey import Survey
 from roadscan.footprints.footprints import PRODUCT, FootprintTask
 from roadscan.georeference.cloud import TilePoints

@@ -31,7 +31,7 @@ from roadscan.assets.kind import AssetKind, asset_kinds
 from roadscan.assets.pictures.sign_types import listed_types
 from roadscan.core.strict import meanings
 from roadscan.core.witness import Witness, witnesses
-from roadscan.ingest.inspect.known_files import known_files
+from roadscan.ingest.inspect.file_kinds import known_files
 from roadscan.ingest.reading.format import LogFormat, log_formats
 from roadscan.store.asset_schema import AssetColumn, AssetSchema, asset_kind_names, asset_schema
 from roadscan.store.readings.packed_returns import beams_query, returns_query

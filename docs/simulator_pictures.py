@@ -31,7 +31,7 @@ from matplotlib.patches import Patch, Polygon
 from scipy.spatial.transform import Rotation, Slerp
 
 from roadscan.simulate import Scene, simulate, truth
-from roadscan.simulate.earth import Earth
+from roadscan.simulate.path import Earth
 from roadscan.simulate.scene import Mount, shipped_scenes
 
 Float64 = npt.NDArray[np.float64]

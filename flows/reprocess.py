@@ -10,8 +10,7 @@ from prefect.client.schemas.objects import State
 
 from roadscan.core.errors import ConfigError, RoadscanError
 from roadscan.core.gpstime import gps_ns_from_utc
-from roadscan.core.grid import Bounds
-from roadscan.core.ids import TileId
+from roadscan.core.grid import Bounds, TileId
 from roadscan.flows.conduct import conduct, run_name
 from roadscan.flows.expected import failed
 from roadscan.run.selection import Selection

@@ -38,9 +38,8 @@ _settle_arithmetic()
 if TYPE_CHECKING:
     from roadscan.arrays import write_profiles, write_returns, write_trajectory
     from roadscan.condition.profiles.profile_files import read_profile, write_erd
-    from roadscan.condition.profiles.spectrum import road_spectrum
-    from roadscan.condition.profiles.straightedge import straightedge_mm
     from roadscan.condition.profiles.tables import iri, localised_roughness, mpd
+    from roadscan.condition.profiles.unevenness import road_spectrum, straightedge_mm
     from roadscan.core.errors import RoadscanError
     from roadscan.door import LogTables, MadeProduct, OpenSurvey, open_survey, read_log
 
@@ -68,8 +67,8 @@ _ELSEWHERE = {
     "RoadscanError": "roadscan.core.errors",
     **dict.fromkeys(("iri", "localised_roughness", "mpd"), "roadscan.condition.profiles.tables"),
     **dict.fromkeys(("read_profile", "write_erd"), "roadscan.condition.profiles.profile_files"),
-    "road_spectrum": "roadscan.condition.profiles.spectrum",
-    "straightedge_mm": "roadscan.condition.profiles.straightedge",
+    "road_spectrum": "roadscan.condition.profiles.unevenness",
+    "straightedge_mm": "roadscan.condition.profiles.unevenness",
     **dict.fromkeys(("write_profiles", "write_returns", "write_trajectory"), "roadscan.arrays"),
 }
 

@@ -7,8 +7,8 @@
 Each returns what it wrote, and refuses what does not say its frame, unit or time system.
 """
 
-from roadscan.formats.lidars.returns_writer import write_returns
-from roadscan.formats.scanners.profiles_writer import WrittenProfiles, write_profiles
+from roadscan.formats.lidars.returns_table import write_returns
+from roadscan.formats.scanners.scans import WrittenProfiles, write_profiles
 from roadscan.formats.trajectories.trajectory_writer import Quaternions, write_trajectory
 from roadscan.ingest.array_files import WrittenLog
 

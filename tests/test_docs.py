@@ -28,8 +28,7 @@ from roadscan.cli import app
 from roadscan.core.crs import MapFrame
 from roadscan.core.errors import StoreError
 from roadscan.core.gpstime import Clock, TimeSystem, gps_ns_from_utc
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileGrid, TileId
 from roadscan.core.survey import Survey, survey_file_model
 from roadscan.ingest.reading.format import LogSource, Reject, Rows, format_of, log_formats
 from roadscan.report.section import sections

@@ -13,8 +13,7 @@ import pandas as pd
 import pytest
 
 from roadscan.core.crs import MapFrame
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import LanePass, PassId, RunId, TileId
+from roadscan.core.grid import LanePass, PassId, RunId, TileGrid, TileId
 from roadscan.georeference.cloud import TilePoints
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.product import ProductContext, Tile, TileSummary

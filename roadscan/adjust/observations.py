@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.array_types import Float64, Int32, Int64, UInt8
-from roadscan.pictures.camera_changes import COLUMNS
+from roadscan.pictures.lens import COLUMNS
 from roadscan.poses.movement import Seat
 
 KINDS: Final = (

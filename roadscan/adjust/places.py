@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.kernels.visits import Bins, Limits, Meetings, Samples, Spread, Visits, feet, meetings, visits
-from roadscan.adjust.tie_settings import PlaceSettings
+from roadscan.adjust.settings import PlaceSettings
 from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.errors import NavigationError
 from roadscan.core.gpstime import NS_PER_S

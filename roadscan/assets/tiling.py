@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from roadscan.assets.scene import Box
-from roadscan.core.grid import Bounds, TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import Bounds, TileGrid, TileId
 
 _ORIGINS_M: Final = 960.0
 """Returns count from the multiples of this in the map (m): whole numbers of the cells of all rasters, and the same for

@@ -18,9 +18,9 @@ import numpy.typing as npt
 from pydantic import Field
 
 from roadscan.compute.array_types import Float64
-from roadscan.core.camera import Interior
 from roadscan.core.errors import ConfigError
 from roadscan.core.extras import cv2
+from roadscan.core.rig import Interior
 from roadscan.core.strict import Strict
 
 Grey = npt.NDArray[np.uint8]

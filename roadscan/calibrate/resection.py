@@ -23,10 +23,9 @@ from roadscan.calibrate.estimator import Calibrated, Calibration, Estimate, Prio
 from roadscan.calibrate.evidence import Known, Seen, Ties, Traverse
 from roadscan.calibrate.rotations import exponential, logarithm
 from roadscan.compute.array_types import Bool, Float64, Int64
-from roadscan.core.camera import Interior
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.extras import cv2
-from roadscan.core.rig import Mounting
+from roadscan.core.rig import Interior, Mounting
 from roadscan.core.settings.calibration import CalibrationSettings
 
 KIND: Final = "resection"

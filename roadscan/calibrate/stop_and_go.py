@@ -33,9 +33,8 @@ from roadscan.compute.robust import SIGMA_OF_MAD
 from roadscan.core.crs import LOCAL_WORLD
 from roadscan.core.errors import NavigationError
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
-from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2, ImuErrors
-from roadscan.core.rig import Mounting
-from roadscan.navigation.inertial.earth import EARTH_RATE_ECEF_RAD_PER_S, gravity_ecef
+from roadscan.core.rig import STANDARD_GRAVITY_M_PER_S2, ImuErrors, Mounting
+from roadscan.navigation.inertial.alignment import EARTH_RATE_ECEF_RAD_PER_S, gravity_ecef
 from roadscan.navigation.inertial.readings import ImuReadings
 from roadscan.poses.trajectory import Trajectory
 

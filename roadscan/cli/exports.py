@@ -111,8 +111,7 @@ def pictures(
     ] = False,
 ) -> None:
     """Copies of pictures with their places in them, a table of their poses, and the cameras' lenses."""
-    from roadscan.export.pictures.chosen import Choice
-    from roadscan.export.pictures.copies import CopySettings, export_pictures
+    from roadscan.export.pictures.copies import Choice, CopySettings, export_pictures
     from roadscan.run.session import Session
 
     reporter = new_reporter()
@@ -126,7 +125,7 @@ def pictures(
 
 def colmap(survey_file: SurveyFile, out: Out, run_id: Run = None, camera: Camera = None, points: Points = None) -> None:
     """Cameras and poses of pictures as COLMAP's text files, in a local frame, so that its dense matching can go on."""
-    from roadscan.export.pictures.chosen import Choice
+    from roadscan.export.pictures.copies import Choice
     from roadscan.export.pictures.reconstructions import export_colmap
     from roadscan.run.session import Session
 
@@ -137,7 +136,7 @@ def opensfm(
     survey_file: SurveyFile, out: Out, run_id: Run = None, camera: Camera = None, points: Points = None
 ) -> None:
     """Cameras and poses of pictures as OpenSfM's reconstruction, which OpenDroneMap reads, in a local frame."""
-    from roadscan.export.pictures.chosen import Choice
+    from roadscan.export.pictures.copies import Choice
     from roadscan.export.pictures.reconstructions import export_opensfm
     from roadscan.run.session import Session
 

@@ -9,8 +9,7 @@ from typing import Annotated, Final, Literal
 import typer
 
 from roadscan.cli.arguments import PlainJson, formats_for
-from roadscan.cli.arrow_alone import arrow_alone
-from roadscan.cli.terminal import looking, print_json, print_table
+from roadscan.cli.terminal import arrow_alone, looking, print_json, print_table
 
 _MOST_REJECTS: Final = 20  # messages that are listed singly
 
@@ -140,7 +139,7 @@ def unpack_topic(
 
     The format images reads such pictures; clock.pairs.table reads such pairs.
     """
-    from roadscan.formats.ros.unpack import unpack
+    from roadscan.formats.ros.overview import unpack
 
     made = unpack(bag, topic, folder)
     typer.echo(f"written: {made.table}, {made.rows:,} rows")

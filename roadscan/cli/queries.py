@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from roadscan.cli.arguments import SurveyOption, SurveyOrFleet, found_survey, options_apart
-from roadscan.cli.arrow_alone import arrow_alone
-from roadscan.cli.terminal import print_table, print_whole
+from roadscan.cli.terminal import arrow_alone, print_table, print_whole
 
 if TYPE_CHECKING:
     import pyarrow as pa

@@ -192,8 +192,7 @@ def reprocess(
 def selected(tiles: list[str] | None, bbox: str | None, span: str | None) -> Selection:
     """The selection of tiles that the options state."""
     from roadscan.core.errors import ConfigError
-    from roadscan.core.grid import Bounds
-    from roadscan.core.ids import TileId
+    from roadscan.core.grid import Bounds, TileId
     from roadscan.run.selection import Selection
 
     box = times = None

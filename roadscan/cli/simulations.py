@@ -67,7 +67,7 @@ def demo(
 ) -> None:
     """Simulate a small survey, run it, and compare the surface with the truth."""
     from roadscan.demo.demo import prepare_demo, summarise
-    from roadscan.site.demo_page import page_lines
+    from roadscan.site.single import page_lines
 
     survey_file = prepare_demo(out, lambda text: typer.echo(text, err=as_json))
     run_survey(survey_file, None, Where(workers))
@@ -79,7 +79,7 @@ def demo(
 
 def _street_in_two_epochs(folder: Path, workers: int | None, as_json: bool) -> list[str]:
     """Survey the demo's street twice, with an edit by hand between; what its inventory says then."""
-    from roadscan.demo.demo_street import AUTUMN, SPRING, STAGES, compare_epochs, edit_by_hand, prepare_street
+    from roadscan.demo.demo import AUTUMN, SPRING, STAGES, compare_epochs, edit_by_hand, prepare_street
 
     files = [prepare_street(folder, epoch, lambda text: typer.echo(text, err=as_json)) for epoch in (SPRING, AUTUMN)]
     run_survey(files[0], STAGES, Where(workers))

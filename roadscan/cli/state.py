@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from roadscan.cli.arguments import PlainJson, SurveyFile, Workers
-from roadscan.cli.arrow_alone import arrow_alone
-from roadscan.cli.terminal import new_reporter, print_json, print_table
+from roadscan.cli.terminal import arrow_alone, new_reporter, print_json, print_table
 
 if TYPE_CHECKING:
     from roadscan.survey.plan import PlannedStage, RunPlan
@@ -45,7 +44,7 @@ def plan(
 ) -> None:
     """What the next run would do, stage by stage; reads no log through and writes nothing."""
     from roadscan.core.errors import ConfigError
-    from roadscan.survey.plan_picture import plan_picture
+    from roadscan.survey.plan import plan_picture
 
     if picture is not None and picture.suffix != ".svg":
         raise ConfigError(f"--picture {picture}", expected="a name that ends with .svg")

@@ -14,7 +14,7 @@ from roadscan.georeference.plan.plan import plan_without_readings
 from roadscan.pictures.placed import plan_pictures
 from roadscan.pictures.points import control_rows
 from roadscan.pictures.settings import PictureTargetsConfig
-from roadscan.pictures.targets.aim import TargetPoint
+from roadscan.pictures.targets.candidates import TargetPoint
 from roadscan.pictures.targets.find import Sought, found_rows, seek
 from roadscan.pictures.views import PictureRule
 from roadscan.run.session import Session

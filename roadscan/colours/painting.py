@@ -9,11 +9,11 @@ from typing import Final, Self
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.colours.cameras import cameras_of
 from roadscan.colours.kernels.looks import (
     Camera,
     Depths,
     Limits,
+    blend,
     keep_best,
     leave_doubtful,
     leave_moved,
@@ -23,6 +23,40 @@ from roadscan.colours.kernels.looks import (
 from roadscan.compute.array_types import Float32, Float64, Int64, UInt8
 from roadscan.pictures.colours import ColourSource
 from roadscan.pictures.placed import Pictures
+
+_STEP_M: Final = 20.0
+"""Distance (m) over which the turn from the map to the world is taken. The map is straight to 1 mm within 50 m: 0.02
+pixels."""
+
+
+def eyes_m(pictures: Pictures) -> Float64:
+    """Returns easting, northing and height (n, 3) of the cameras (m)."""
+    out = np.empty((len(pictures), 3))
+    for number, world in enumerate(pictures.worlds):
+        own = pictures.views.world == number
+        if own.any():
+            out[own] = pictures.map.map_from_world(world, pictures.views.eye_world_m[own])
+    return out
+
+
+def cameras_of(pictures: Pictures, origin_m: Float64) -> list[Camera]:
+    """Returns the pictures as kernels take them; their places count from `origin_m` (3,) in the map."""
+    if not len(pictures):
+        return []
+    views, eyes = pictures.views, eyes_m(pictures)
+    return [
+        Camera(eyes[n] - origin_m, _axes(pictures, n, eyes[n]), views.lens_of(n).parameters)
+        for n in range(len(pictures))
+    ]
+
+
+def _axes(pictures: Pictures, number: int, eye_m: Float64) -> Float64:
+    """Returns camera axes (3, 3) from the map: the camera's from the world's, and the world's from the map's there."""
+    around = np.concatenate([eye_m + _STEP_M * np.eye(3), eye_m - _STEP_M * np.eye(3)])
+    world = pictures.map.world_from_map(pictures.worlds[pictures.views.world[number]], around)
+    turn = ((world[:3] - world[3:]) / (2.0 * _STEP_M)).T
+    return np.ascontiguousarray(pictures.views.opencv_from_world[number] @ turn)
+
 
 _RAMP: Final = 0.05
 """Share of a picture's shorter edge in which weights rise from the border."""
@@ -158,3 +192,15 @@ class _Box:
         """Returns the distance from a camera to the box; 0 within."""
         out = np.maximum(np.maximum(self.low - camera.eye_m, camera.eye_m - self.high), 0.0)
         return float(np.sqrt((out**2).sum()))
+
+
+def blended(looks: Looks) -> tuple[UInt8, npt.NDArray[np.int32]]:
+    """Returns colours (n, 3), from 1, 0 without a look, and the number of the picture (n,) of most weight, −1: none.
+
+    Where three pictures or more see a place, those that differ from the median of all are left out: something moved
+    there. Of the others the best has most weight, and weights are smooth over the ground, so that seams are blended.
+    """
+    colour, number = np.zeros((len(looks.weight), 3), np.uint8), np.full(len(looks.weight), -1, np.int32)
+    median, count = looks.medians()
+    blend(looks.colour, looks.weight, looks.number, median, count, colour, number)
+    return colour, number

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from roadscan.colours.settings import ColoursConfig
-from roadscan.colours.tasks.depths import write_depths
-from roadscan.colours.tasks.gains import GAINS
+from roadscan.colours.tasks.depths import GAINS, write_depths
 from roadscan.colours.tasks.orthophoto import ORTHOPHOTO, make_photo
 from roadscan.colours.tasks.plan import DEPTHS, check_cameras
 from roadscan.colours.tasks.points import POINTS, colour_points

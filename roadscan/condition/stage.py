@@ -62,10 +62,9 @@ class Condition(Stage):
         from roadscan.condition.tasks.ravelling import patches_of_group
         from roadscan.condition.tasks.road_edges import edges_of_pieces
         from roadscan.condition.tasks.roughness_regions import regions_of_pieces
-        from roadscan.condition.tasks.sections import write_sections
+        from roadscan.condition.tasks.sections import write_sections, write_tiles
         from roadscan.condition.tasks.stretches import stretch_tasks, survey_stretches
         from roadscan.condition.tasks.tasks import run_units
-        from roadscan.condition.tasks.tile_summary import write_tiles
         from roadscan.condition.tasks.values import GroupTask, values_of_group
         from roadscan.condition.tasks.work import plan_condition
 
@@ -124,7 +123,7 @@ class Condition(Stage):
         """Check that layers open as stated, and that a surface is made where its heights are requested."""
         from roadscan.condition.tasks.lines import check_layer
         from roadscan.condition.tasks.road_edges import check_edge_polygons
-        from roadscan.condition.tasks.surface_cells import check_surface_cells
+        from roadscan.condition.tasks.stretches import check_surface_cells
 
         try:
             config = ConditionConfig.stated(survey)

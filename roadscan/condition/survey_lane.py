@@ -11,8 +11,7 @@ import numpy as np
 
 from roadscan.compute.array_types import Float64
 from roadscan.condition.kernels.sampling import CellTable, sample
-from roadscan.condition.on_lane.lines import LINE_REACH_M, LaneLines, lane_lines
-from roadscan.condition.on_lane.squares import TextureSquares, texture_squares
+from roadscan.condition.lane_data import LINE_REACH_M, LaneLines, TextureSquares, lane_lines, texture_squares
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.settings import SectionConfig
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import math
 import re
 from collections.abc import Iterator, Mapping
@@ -13,10 +14,146 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from roadscan.core.camera import Interior
 from roadscan.core.frames import BODY_FROM_AXES, body_from_axes, rotation_from_rph
-from roadscan.core.imu import IMU_GRADES, ImuErrors, ImuGrade
 from roadscan.core.strict import Strict, load_toml
+
+
+class Interior(Strict):
+    """Interior orientation: a pixel has u = cx + fx · x', v = cy + fy · y', where x', y' are the distorted tangents.
+
+    Tangents are taken in OpenCV's camera axes, x right, y down, z along the optical axis; the sensor frame of the
+    rig has x along the optical axis, y right, z down (`axes = "frd"`). In a picture of 360° x' and y' are angles
+    (radians): x' to the right around the camera's y axis, from −π to π, and y' downwards from its horizon.
+    """
+
+    model: Literal["perspective", "equirectangular"] = "perspective"
+    """`perspective`, or `equirectangular` for pictures of 360°, whose columns and rows are even steps of these angles;
+    the optical axis is then the direction that the middle column looks to."""
+    width_px: int = Field(ge=1)
+    """Width of the pictures that this holds for."""
+    height_px: int = Field(ge=1)
+    """Height of these pictures."""
+    focal_px: tuple[float, float]
+    """fx, fy (pixels; of a picture of 360° pixels a radian, those of the whole sphere where left out)."""
+    principal_px: tuple[float, float]
+    """cx, cy, from the centre of the upper left pixel (pixels); may be left out for a picture of 360°: its middle."""
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1, p2, k3."""
+    line_time_us: float = Field(default=0.0, ge=-1000.0, le=1000.0)
+    """Time from the exposure of a row to that of the row below (µs): of a rolling shutter; 0 of a global one. The stamp
+    of a picture is the time of its middle row."""
+    sigma_focal_px: tuple[float, float] | None = None
+    """1 σ of `focal_px`, from the calibration."""
+    sigma_principal_px: tuple[float, float] | None = None
+    """1 σ of `principal_px`."""
+    sigma_distortion: tuple[float, float, float, float, float] | None = None
+    """1 σ of `distortion`."""
+    sigma_line_time_us: float | None = Field(default=None, ge=0.0)
+    """1 σ of `line_time_us`."""
+    rms_px: float | None = Field(default=None, ge=0.0)
+    """RMS of the calibration's residuals (pixels)."""
+    pictures: int | None = Field(default=None, ge=0)
+    """Pictures the calibration used."""
+    date: dt.date | None = None
+    """Day of the calibration."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_the_sphere(cls, values: Any) -> Any:
+        """Return the values with focal length and principal point filled in from the size of a full-sphere picture."""
+        if not isinstance(values, dict) or values.get("model") != "equirectangular":
+            return values
+        width, height = values.get("width_px"), values.get("height_px")
+        if not isinstance(width, int) or not isinstance(height, int):
+            return values
+        sphere = {
+            "focal_px": (width / (2.0 * math.pi), height / math.pi),
+            "principal_px": ((width - 1) / 2.0, (height - 1) / 2.0),
+        }
+        return sphere | values
+
+    @model_validator(mode="after")
+    def _has_no_lens(self) -> Interior:
+        if self.model == "equirectangular":
+            if any(self.distortion):
+                raise ValueError("distortion is none of an equirectangular picture: its pixels are angles")
+            if self.width_px > 2.0 * math.pi * self.focal_px[0] + 1.0:
+                raise ValueError(
+                    f"width_px {self.width_px} is more than a turn of 360° with focal_px {self.focal_px[0]:g}"
+                )
+        return self
+
+
+STANDARD_GRAVITY_M_PER_S2: Final = 9.80665
+"""Size of the unit g (CGPM 1901), and the gravity of local frames."""
+ImuGrade = Literal["perfect", "navigation", "tactical", "industrial", "mems"]
+"""How good an inertial measurement unit is."""
+
+
+class ImuErrors(Strict):
+    """Errors of an inertial measurement unit, 1 σ; biases change as Gauss–Markov processes."""
+
+    gyro_noise_deg_per_sqrt_h: float = Field(ge=0.0)
+    """Angle random walk."""
+    gyro_bias_deg_per_h: float = Field(ge=0.0)
+    """Bias of each gyroscope."""
+    gyro_scale_ppm: float = Field(ge=0.0)
+    """Scale error of each gyroscope."""
+    accel_noise_ug_per_sqrt_hz: float = Field(ge=0.0)
+    """Velocity random walk, as noise density of the accelerometers (µg/√Hz)."""
+    accel_bias_mg: float = Field(ge=0.0)
+    """Bias of each accelerometer (mg)."""
+    accel_scale_ppm: float = Field(ge=0.0)
+    """Scale error of each accelerometer."""
+    bias_time_constant_s: float = Field(default=600.0, gt=0.0)
+    """Time constant of the biases (s)."""
+
+
+IMU_GRADES: Final[dict[ImuGrade, ImuErrors]] = {
+    "perfect": ImuErrors(
+        gyro_noise_deg_per_sqrt_h=0.0,
+        gyro_bias_deg_per_h=0.0,
+        gyro_scale_ppm=0.0,
+        accel_noise_ug_per_sqrt_hz=0.0,
+        accel_bias_mg=0.0,
+        accel_scale_ppm=0.0,
+    ),
+    "navigation": ImuErrors(
+        gyro_noise_deg_per_sqrt_h=0.002,
+        gyro_bias_deg_per_h=0.005,
+        gyro_scale_ppm=5.0,
+        accel_noise_ug_per_sqrt_hz=10.0,
+        accel_bias_mg=0.03,
+        accel_scale_ppm=50.0,
+        bias_time_constant_s=3600.0,
+    ),
+    "tactical": ImuErrors(
+        gyro_noise_deg_per_sqrt_h=0.07,
+        gyro_bias_deg_per_h=1.0,
+        gyro_scale_ppm=150.0,
+        accel_noise_ug_per_sqrt_hz=50.0,
+        accel_bias_mg=1.0,
+        accel_scale_ppm=300.0,
+    ),
+    "industrial": ImuErrors(
+        gyro_noise_deg_per_sqrt_h=0.2,
+        gyro_bias_deg_per_h=10.0,
+        gyro_scale_ppm=500.0,
+        accel_noise_ug_per_sqrt_hz=60.0,
+        accel_bias_mg=3.0,
+        accel_scale_ppm=1000.0,
+    ),
+    "mems": ImuErrors(
+        gyro_noise_deg_per_sqrt_h=0.4,
+        gyro_bias_deg_per_h=100.0,
+        gyro_scale_ppm=3000.0,
+        accel_noise_ug_per_sqrt_hz=150.0,
+        accel_bias_mg=10.0,
+        accel_scale_ppm=3000.0,
+    ),
+}
+"""Errors by grade, the orders of magnitude of Groves (2013), table 4.1 and 4.2."""
+
 
 Float64 = npt.NDArray[np.float64]
 

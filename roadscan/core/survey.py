@@ -13,14 +13,12 @@ from roadscan.core.clock_evidence import MotionEvidence, PairEvidence
 from roadscan.core.crs import Anchor, Geoid, MapFrame, check_not_mirrored
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.gpstime import Clock, TimeSystem, check_week, gps_ns_from_utc
-from roadscan.core.ids import LanePass, PassId, RunId
+from roadscan.core.grid import LanePass, PassId, RunId
 from roadscan.core.plugins import found_kinds
 from roadscan.core.rig import Rig, Sensor
 from roadscan.core.settings.calibration import CalibrationEvidence, CalibrationSettings
-from roadscan.core.settings.odometry import OdometryConfig
-from roadscan.core.settings.ppk import PpkSettings
+from roadscan.core.settings.navigation import OdometryConfig, PpkSettings, SmootherConfig, SplineConfig
 from roadscan.core.settings.segmentation import RoadSegmentation
-from roadscan.core.settings.smoothing import SmootherConfig, SplineConfig
 from roadscan.core.strict import MEANINGS, NAME_PATTERN, Strict, load_toml
 
 ENTRY_POINT_GROUP: Final = "roadscan.survey_sections"

@@ -542,7 +542,7 @@ class _Heard(Reporter):
 
 
 def _selection(tiles: Sequence[str] | None) -> Selection | None:
-    from roadscan.core.ids import TileId
+    from roadscan.core.grid import TileId
     from roadscan.run.selection import Selection
 
     return None if tiles is None else Selection(tuple(map(TileId.parse, tiles)))

@@ -12,8 +12,7 @@ from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.extras import needed
 from roadscan.core.frames import ENU_FROM_NED, ecef_from_ned, rotation_from_quaternion, rph_from_rotation
-from roadscan.core.grid import Bounds
-from roadscan.core.ids import TileId
+from roadscan.core.grid import Bounds, TileId
 from roadscan.core.witness import Finding
 from roadscan.footprints.footprints import footprints_of
 from roadscan.georeference.plan.plan import plan_of, trajectory_source

@@ -15,14 +15,13 @@ import pyarrow.parquet as pq
 
 from roadscan.compute.array_types import Int64, UInt8
 from roadscan.core.errors import ConfigError, nearest
-from roadscan.core.ids import LanePass, TileId
+from roadscan.core.grid import LanePass, TileId
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.core.survey import Survey
-from roadscan.georeference.centre_line import CentreLineBuffer
-from roadscan.georeference.classes import KEPT, OFF_CENTRE_LINE, OUTSIDE_PASS, READING_CLASSES
 from roadscan.georeference.place import Placed, passes_of
-from roadscan.georeference.plan.centre_line import load_buffer
+from roadscan.georeference.plan.centre_line import CentreLineBuffer, load_buffer
 from roadscan.georeference.plan.plan import SurveyPlan, plan_survey
+from roadscan.georeference.road_profiles import KEPT, OFF_CENTRE_LINE, OUTSIDE_PASS, READING_CLASSES
 from roadscan.georeference.sources import Georeferencer, RawSlice, geometry_of
 from roadscan.store.damage import UNREADABLE
 from roadscan.store.schema import table_schema

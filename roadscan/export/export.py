@@ -11,7 +11,7 @@ from pathlib import Path
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.sources import ReadingSource
-from roadscan.store.holding.beside import beside
+from roadscan.store.holders import beside
 from roadscan.store.logs import DataFile
 
 

@@ -16,8 +16,7 @@ from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.kernels.curved_grid import accumulate_curved
 from roadscan.compute.reference_line import ReferenceLine
 from roadscan.core.errors import ConfigError, RunError
-from roadscan.core.grid import QUANTUM_M
-from roadscan.core.ids import LanePass
+from roadscan.core.grid import QUANTUM_M, LanePass
 from roadscan.core.survey import Survey
 from roadscan.export.export import Exported, published, source_in
 from roadscan.formats.clouds.opencrg_file import CurvedRegularGrid, write_crg

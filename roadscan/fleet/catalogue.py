@@ -16,8 +16,8 @@ from roadscan.core.errors import DamagedError
 from roadscan.core.gpstime import iso_from_gps_ns
 from roadscan.fleet.members import Found, surveys_in
 from roadscan.fleet.row import Row, row_key, row_of
+from roadscan.store.digest import bears_seal, check_seal, sealed_parquet, without_seal
 from roadscan.store.schema import table_schema
-from roadscan.store.seal import bears_seal, check_seal, sealed_parquet, without_seal
 from roadscan.store.store import opened_url, put_file
 
 TABLE: Final = "fleet"
@@ -51,7 +51,7 @@ def make_catalogue(place: str) -> Catalogue:
     StoreError
         It cannot be written.
     """
-    from roadscan.fleet.page import fleet_page  # A question to a fleet draws no page.
+    from roadscan.fleet.row import fleet_page  # A question to a fleet draws no page.
 
     fs, base = opened_url(place)
     base = f"{base.rstrip('/')}/{FOLDER}"

@@ -29,10 +29,9 @@ from roadscan.run.engine.compute import Compute
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.run.session import Session, found_once
 from roadscan.run.stage import StageState
-from roadscan.store.digest import bytes_digest
+from roadscan.store.digest import bytes_digest, sealed_parquet
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
-from roadscan.store.seal import sealed_parquet
 from roadscan.store.store import Store
 from roadscan.store.writer import parquet_bytes
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from roadscan.calibrate.tasks.calibrate import outdated_calibrations, renew_reports
-from roadscan.calibrate.tasks.mounting_status import mounting_lines
+from roadscan.calibrate.tasks.calibrate import mounting_lines, outdated_calibrations, renew_reports
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
 from roadscan.footprints.footprints import (

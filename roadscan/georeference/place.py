@@ -23,18 +23,23 @@ from roadscan.core.crs import (
     world_frame_of,
 )
 from roadscan.core.errors import CrsError
-from roadscan.core.grid import QUANTA_PER_M
-from roadscan.core.ids import LanePass
+from roadscan.core.grid import QUANTA_PER_M, LanePass
 from roadscan.core.rig import Mounting, Mountings
 from roadscan.core.scan_geometry import ScanGeometry
-from roadscan.georeference.charts import Charts, georeference_of
-from roadscan.georeference.classes import KEPT, NOT_ROAD, READING_CLASSES, TOO_HIGH, TOO_LOW
-from roadscan.georeference.flat_profiles import EVERY_RAW_RANGE, flat_profiles
+from roadscan.georeference.charts import EVERY_RAW_RANGE, Charts, flat_profiles, georeference_of
 from roadscan.georeference.kernels import readings as kernels
 from roadscan.georeference.kernels.flat_profiles import georeference_flat_profiles
 from roadscan.georeference.kernels.readings import FATES, Georeference, Limits, MirrorProfiles, Points, Returns
-from roadscan.georeference.kernels.timed_points import georeference_mirror, georeference_returns
-from roadscan.georeference.road_profiles import RoadFinder, RoadProfiles
+from roadscan.georeference.kernels.timed_readings import georeference_mirror, georeference_returns
+from roadscan.georeference.road_profiles import (
+    KEPT,
+    NOT_ROAD,
+    READING_CLASSES,
+    TOO_HIGH,
+    TOO_LOW,
+    RoadFinder,
+    RoadProfiles,
+)
 from roadscan.poses.trajectory import Trajectory
 
 EIGHT_TO_SIXTEEN_BITS: Final = 257

@@ -15,9 +15,9 @@ from roadscan.core.grid import QUANTA_PER_M
 from roadscan.core.rig import Mounting, Mountings
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.georeference.charts import Charts, georeference_of
-from roadscan.georeference.kernels.block_ranges import block_ranges
 from roadscan.georeference.kernels.reach import SpannedProfiles, reach_of_profiles, reach_of_returns
 from roadscan.georeference.kernels.readings import Georeference, Limits
+from roadscan.georeference.kernels.tile_set import block_ranges
 from roadscan.poses.movement import NO_CORRECTION, Allowance
 from roadscan.poses.trajectory import Trajectory
 

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.kernels.readings import KEPT, OUTSIDE
 from roadscan.georeference.place import COUNTED_FATES, FATE_NAMES

@@ -10,7 +10,7 @@ from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.kernel_options import read_only
 from roadscan.core.crs import MapFrame
 from roadscan.core.rig import Mountings
-from roadscan.georeference.kernels.timed_points import between_ticks
+from roadscan.georeference.kernels.timed_readings import between_ticks
 from roadscan.poses.trajectory import Trajectory
 
 _TICK_NS: Final = 20_000_000

@@ -31,9 +31,8 @@ from roadscan.georeference.place import (
     cloud_classes,
     place_cloud,
 )
-from roadscan.georeference.road_profiles import RoadFinder
-from roadscan.georeference.turns import TICK_NS, WINDOW_NS
-from roadscan.ingest.clocks.correction import ClockCorrection
+from roadscan.georeference.road_profiles import TICK_NS, WINDOW_NS, RoadFinder
+from roadscan.ingest.clock_correction import ClockCorrection
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded, load_trajectory
 from roadscan.poses.movement import NO_CORRECTION, Allowance, MountingChange
 from roadscan.poses.trajectory import Trajectory

@@ -280,14 +280,12 @@ def _items(log: PlannedLog, header: LogHeader) -> Iterator[Item]:
 def _checks(source: LogSource, header: LogHeader) -> list[LogCheck]:
     """Return the checks that follow the rows of a log, in the order in which they run."""
     # Here, since `status` and `sql` import this module for its plan alone.
-    from roadscan.ingest.epoch_order import EpochOrder
-    from roadscan.ingest.laser_ranges import LaserRanges
+    from roadscan.ingest.epoch_order import EpochOrder, StandingClock
     from roadscan.ingest.log_check import Refuses
     from roadscan.ingest.motion_checks import MotionCheck, RepeatedProfiles
-    from roadscan.ingest.one_stamp import StandingClock
     from roadscan.ingest.pose_checks import PoseRecords
-    from roadscan.ingest.reading.future_times import FutureTimes
-    from roadscan.ingest.stray_points import CloudPoints, FarReturns
+    from roadscan.ingest.reading.stamps import FutureTimes
+    from roadscan.ingest.return_checks import CloudPoints, FarReturns, LaserRanges
 
     free = source.clock is not None and source.clock.system is TimeSystem.FREE
     poses = PoseRecords()

@@ -12,9 +12,9 @@ from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.core.rig import Sensor
 from roadscan.core.strict import Strict
 from roadscan.core.survey import ControlConfig, LogConfig, Survey
-from roadscan.ingest.clocks.stated_pairs import log_clock
-from roadscan.ingest.one_stamp import STAMPED
-from roadscan.ingest.one_stamp import VERSION as STAMP_CHECKS
+from roadscan.ingest.clock_pairs import log_clock
+from roadscan.ingest.epoch_order import STAMPED
+from roadscan.ingest.epoch_order import VERSION as STAMP_CHECKS
 from roadscan.ingest.place_checks import PLACED
 from roadscan.ingest.place_checks import VERSION as PLACE_CHECKS
 from roadscan.ingest.pose_checks import FIXES, POSES

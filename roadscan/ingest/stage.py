@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
+from roadscan.ingest.epoch_order import one_stamp_findings, one_stamp_logs
 from roadscan.ingest.ingest import DATA_TABLES, ingest, ingested_of
-from roadscan.ingest.one_stamp import one_stamp_findings, one_stamp_logs
 from roadscan.ingest.overlap import (
     Fault,
     NothingPlacedError,
@@ -19,7 +19,7 @@ from roadscan.ingest.overlap import (
 )
 from roadscan.ingest.planned_logs import PlannedLog, logs_of
 from roadscan.ingest.reading.format import LogFormat
-from roadscan.ingest.same_content import same_content_findings
+from roadscan.ingest.sources import same_content_findings
 from roadscan.run.memory import BYTES_PER_READING, WORKER_BASE_BYTES
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState

@@ -24,9 +24,8 @@ from roadscan.core.errors import ConfigError, nearest
 from roadscan.inventory.identity import outlines, points_along
 from roadscan.inventory.state import live_commits
 from roadscan.inventory.values import SIGMA_LEAST_M, encoded, sigma_of
-from roadscan.store.asset_schema import asset_schema
+from roadscan.store.asset_schema import GEOMETRY, asset_schema, asset_table
 from roadscan.store.asset_truth import AssetTruth, Commit
-from roadscan.store.inventory_schema import GEOMETRY, asset_table
 
 _MISSED_BY_A_PASS: Final = 0.1  # Greatest share of the assets in sight that a pass misses.
 _FALSE_SHARE: Final = 0.01  # Expected share of false changes among those reported.

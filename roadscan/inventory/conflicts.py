@@ -14,8 +14,7 @@ import shapely
 from roadscan.inventory.edits import REJECTED, Edit
 from roadscan.inventory.state import State, reference_points
 from roadscan.inventory.values import decoded, encoded, sigmas_apart
-from roadscan.store.asset_schema import asset_schema
-from roadscan.store.inventory_schema import GEOMETRY
+from roadscan.store.asset_schema import GEOMETRY, asset_schema
 
 CONFLICT_COLUMNS: Final = (
     "asset_id", "layer", "attribute", "reason", "in_force", "other", "base", "sigmas", "who", "edit", "pictures",

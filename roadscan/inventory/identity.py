@@ -17,9 +17,8 @@ import shapely
 
 from roadscan.compute.array_types import Float64, Int64
 from roadscan.inventory.settings import Matching
-from roadscan.store.asset_schema import asset_schema
+from roadscan.store.asset_schema import GEOMETRY, asset_schema
 from roadscan.store.digest import bytes_digest
-from roadscan.store.inventory_schema import GEOMETRY
 
 _SIGMAS: Final = 4.0
 """Gate of a match, in σ of the difference of two positions."""

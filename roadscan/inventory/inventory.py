@@ -19,20 +19,27 @@ from roadscan.core.gpstime import now_utc
 from roadscan.core.witness import Finding
 from roadscan.inventory.changes import EpochChanges, Event, epoch_changes, history_of
 from roadscan.inventory.checks import faults_of
-from roadscan.inventory.comparing import Changes, compared, published_rows, published_table
+from roadscan.inventory.comparing import (
+    Changes,
+    Pulling,
+    clocked,
+    compared,
+    new_edits,
+    published_rows,
+    published_table,
+    refuse,
+)
 from roadscan.inventory.conflicts import Conflict, conflict_rows, conflicts_of
 from roadscan.inventory.diff import Differences, differences
 from roadscan.inventory.edits import Edit, edit_rows
 from roadscan.inventory.home import FID, Author, Content, EditFault, Home, HomeError, Mark, Sheet
 from roadscan.inventory.homes.page_edits import EditOutcome, PageDocument, PageEdits
-from roadscan.inventory.pulling import Pulling, clocked, new_edits, refuse
-from roadscan.inventory.qgis.project import Raster, Source, project_text
+from roadscan.inventory.qgis import Raster, Source, project_text
 from roadscan.inventory.recording import Found, Rules, record
 from roadscan.inventory.state import State, commit_at, live_commits, state_at
-from roadscan.store.asset_schema import asset_kind_names, asset_schema
+from roadscan.store.asset_schema import asset_kind_names, asset_schema, asset_table
 from roadscan.store.asset_truth import AssetTruth, Commit, Draft
 from roadscan.store.digest import bytes_digest
-from roadscan.store.inventory_schema import asset_table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -392,7 +399,7 @@ class Inventory:
         ConfigError
             where the form is unknown.
         """
-        from roadscan.inventory.export import export
+        from roadscan.inventory.diff import export
 
         return export(self.state(as_of), file, form, self.crs)
 

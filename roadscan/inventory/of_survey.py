@@ -13,18 +13,17 @@ from roadscan.assets.settings import AssetsConfig
 from roadscan.assets.tasks.evidence import VISIBILITY
 from roadscan.assets.tasks.plan import asset_grid
 from roadscan.core.crs import crs_from_text
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.core.survey import Survey
 from roadscan.georeference.plan.plan import plan_of
-from roadscan.inventory.found_distresses import SeenByCells, found_distresses
+from roadscan.inventory.found_distresses import SeenByCells, Unknown, Visibility, VisibilityOfSquares, found_distresses
 from roadscan.inventory.home import Home, HomeError
 from roadscan.inventory.homes.geopackage import GeoPackage
 from roadscan.inventory.homes.page_edits import PageDocument
 from roadscan.inventory.inventory import Inventory
-from roadscan.inventory.qgis.project import Raster
+from roadscan.inventory.qgis import Raster
 from roadscan.inventory.recording import Found, Rules
 from roadscan.inventory.settings import InventoryConfig
-from roadscan.inventory.visibility import Unknown, Visibility, VisibilityOfSquares
 from roadscan.run.session import Session
 from roadscan.store.asset_schema import asset_kind_names, asset_schema
 from roadscan.store.asset_truth import COMMITS, AssetTruth

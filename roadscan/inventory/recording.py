@@ -14,14 +14,13 @@ import shapely
 
 from roadscan.core.errors import SchemaError
 from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, leap_seconds_at_gps, utc_from_gps_ns
+from roadscan.inventory.found_distresses import NOT_KNOWN, Visibility
 from roadscan.inventory.identity import Known, matched, new_ids
 from roadscan.inventory.settings import Matching
 from roadscan.inventory.state import Assets, State, live_commits, state_at
 from roadscan.inventory.values import iso_column
-from roadscan.inventory.visibility import NOT_KNOWN, Visibility
-from roadscan.store.asset_schema import asset_kind_names, asset_schema
+from roadscan.store.asset_schema import GEOMETRY, asset_kind_names, asset_schema, asset_table, evidence_table
 from roadscan.store.asset_truth import AssetTruth, Commit, Draft
-from roadscan.store.inventory_schema import GEOMETRY, asset_table, evidence_table
 
 _EPOCH: Final = "first_epoch_gps_ns"
 

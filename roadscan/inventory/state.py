@@ -22,9 +22,8 @@ import shapely
 from roadscan.core.errors import ConfigError
 from roadscan.inventory.edits import Edit, Folded, folded, read_edits
 from roadscan.inventory.values import decoded
-from roadscan.store.asset_schema import asset_kind_names
+from roadscan.store.asset_schema import GEOMETRY, asset_kind_names, asset_table
 from roadscan.store.asset_truth import AssetTruth, Commit
-from roadscan.store.inventory_schema import GEOMETRY, asset_table
 
 _OF_THE_PLACE: Final = ("station_m", "offset_m", "lane")
 """Columns that were measured at the place of the evidence; unknown if a person moved the asset."""

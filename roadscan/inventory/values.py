@@ -14,7 +14,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import shapely
 
-from roadscan.store.inventory_schema import GEOMETRY, asset_columns, asset_table
+from roadscan.store.asset_schema import GEOMETRY, asset_columns, asset_table
 
 SIGMA_LEAST_M: Final = 0.005
 """Least σ that is assumed of any evidence (m)."""

@@ -13,8 +13,7 @@ import numpy.typing as npt
 
 from roadscan.compute.array_types import Float64
 from roadscan.compute.robust import scatter_about
-from roadscan.core.grid import Bounds, TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import Bounds, TileGrid, TileId
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.store import Store
 from roadscan.tiles.pyramid import overview_factors

@@ -1,4 +1,9 @@
-"""Places and orientations of pictures on the map, with the uncertainty that trajectory and mounting state."""
+"""Places and orientations of pictures on the map, with the uncertainty that trajectory and mounting state.
+
+Orientations of pictures in the conventions that other programs use.
+
+Camera axes are OpenCV's: x right, y down, z ahead. Image axes of photogrammetry are x right, y up, z backwards.
+"""
 
 from __future__ import annotations
 
@@ -12,21 +17,57 @@ import numpy as np
 from roadscan.calibrate.resection import SENSOR_FROM_OPENCV
 from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
+from roadscan.core.frames import rph_from_rotation
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.core.ids import of_run
+from roadscan.core.grid import of_run
 from roadscan.core.rig import Sensor
 from roadscan.georeference.picture_axes import camera_from_map, map_from_ned
 from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory_source
 from roadscan.georeference.sources import MOUNTING_COLUMNS, MOUNTING_SIGMAS, key_of_row, load_mountings
-from roadscan.measuring.orientation import nearest_rotation
-from roadscan.navigation.tasks.pose_sigma import pose_sigma, stated_pose_sigma
-from roadscan.navigation.tasks.trajectories import TrajectorySource, load_corrections, load_trajectory
-from roadscan.pictures.camera_changes import JOINT, JointCovariances, load_joint_covariances
-from roadscan.pictures.camera_changes import TABLE as CAMERA_CHANGES
-from roadscan.pictures.lens import PARAMETERS
+from roadscan.navigation.tasks.trajectories import (
+    TrajectorySource,
+    load_corrections,
+    load_trajectory,
+    pose_sigma,
+    stated_pose_sigma,
+)
+from roadscan.pictures.lens import JOINT, PARAMETERS, JointCovariances, load_joint_covariances
+from roadscan.pictures.lens import TABLE as CAMERA_CHANGES
 from roadscan.pictures.placed import Pictures
 from roadscan.poses.trajectory import world_from_ned
 from roadscan.store.small_tables import read_small
+
+_IMAGE_FROM_CAMERA: Final = np.diag([1.0, -1.0, -1.0])
+"""Image axes of photogrammetry (right, up, backwards) from OpenCV's (right, down, ahead); its own inverse."""
+
+
+def nearest_rotation(matrix: Float64) -> Float64:
+    """Return the rotations (n, 3, 3) nearest to matrices that also scale (n, 3, 3). Polar decomposition by SVD."""
+    u, _, v = np.linalg.svd(matrix)
+    return np.asarray(u @ v, np.float64)
+
+
+def omega_phi_kappa_deg(map_from_camera: Float64) -> Float64:
+    """Return ω, φ, κ (n, 3; degrees) of rotations (n, 3, 3) from camera axes to easting, northing, height.
+
+    The image axes are turned into those of the map by Rx(ω) · Ry(φ) · Rz(κ) (Kraus 2007, Photogrammetry, B 3.3).
+    """
+    r = map_from_camera @ _IMAGE_FROM_CAMERA
+    omega, phi = np.arctan2(-r[:, 1, 2], r[:, 2, 2]), np.arcsin(np.clip(r[:, 0, 2], -1.0, 1.0))
+    kappa = np.arctan2(-r[:, 0, 1], r[:, 0, 0])
+    out: Float64 = np.degrees(np.stack([omega, phi, kappa], axis=-1))
+    return out
+
+
+def yaw_pitch_roll_deg(ned_from_camera: Float64) -> Float64:
+    """Return yaw, pitch, roll (n, 3; degrees) of the optical axes of rotations (n, 3, 3) from camera axes to NED.
+
+    Yaw is clockwise from true north, from 0 to 360; pitch is upwards from the horizon; roll is about the optical axis,
+    positive where the picture's right side is lowered.
+    """
+    roll, pitch, yaw = rph_from_rotation(ned_from_camera @ SENSOR_FROM_OPENCV.T)
+    return np.degrees(np.stack([yaw, pitch, roll], axis=-1))
+
 
 _WORDS: Final = {0: "position", 3: "roll, pitch, heading"}
 """Words for the components of a pose, by the first of each."""

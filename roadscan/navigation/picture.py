@@ -15,7 +15,7 @@ from roadscan.core.canvas import empty_figure, save_whole
 from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
 from roadscan.core.frames import ENU_FROM_NED, ecef_from_ned, rotation_from_quaternion
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
-from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2
+from roadscan.core.rig import STANDARD_GRAVITY_M_PER_S2
 from roadscan.navigation.inertial.readings import GnssSolutions, Innovations, Solution
 
 if TYPE_CHECKING:

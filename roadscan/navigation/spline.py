@@ -31,7 +31,7 @@ from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.compute.flags import runs_of
 from roadscan.core.errors import NavigationError
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
-from roadscan.core.settings.smoothing import SplineConfig
+from roadscan.core.settings.navigation import SplineConfig
 from roadscan.navigation.inertial.motion import ned_from_world
 from roadscan.poses.trajectory import Trajectory
 

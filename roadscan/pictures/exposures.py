@@ -13,12 +13,11 @@ import numpy.typing as npt
 
 from roadscan.calibrate.resection import SENSOR_FROM_OPENCV
 from roadscan.compute.array_types import Bool, Float64, Int64
-from roadscan.core.camera import Interior
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.core.rig import Sensor
+from roadscan.core.rig import Interior, Sensor
 from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory_source
 from roadscan.georeference.sources import load_mountings
-from roadscan.navigation.tasks.taken_pictures import TakenPictures
+from roadscan.navigation.tasks.recorded_pictures import TakenPictures
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded
 from roadscan.pictures.frames.chosen import camera_pictures, folder_of
 from roadscan.pictures.views import Lens

@@ -11,10 +11,19 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.array_types import Bool, Float64, Int64, UInt8
-from roadscan.core.camera import Interior
 from roadscan.core.extras import cv2
-from roadscan.pictures.kernels.lens import AROUND, FOLD, HEIGHT, PARAMETERS, ROW_SHIFT, ROW_TURN, WIDTH
-from roadscan.pictures.kernels.picture_colours import sample, take_better
+from roadscan.core.rig import Interior
+from roadscan.pictures.kernels.lens import (
+    AROUND,
+    FOLD,
+    HEIGHT,
+    PARAMETERS,
+    ROW_SHIFT,
+    ROW_TURN,
+    WIDTH,
+    sample,
+    take_better,
+)
 
 __all__ = ["AROUND", "HEIGHT", "NO_VIEW", "WIDTH", "Lens", "PictureRule", "Shown", "Sights", "Views",
            "best_views", "sampled", "sights"]  # fmt: skip

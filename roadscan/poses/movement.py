@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.compute.array_types import Float64
+from roadscan.compute.array_types import Float64, Int64
+from roadscan.core.crs import LOCAL_WORLD, MapFrame, geodetic_from_world
+from roadscan.core.frames import ENU_FROM_NED, ecef_from_ned, rph_from_rotation
 from roadscan.core.rig import Mounting, Mountings
-from roadscan.poses.trajectory import Corrections
+from roadscan.poses.trajectory import Corrections, Poses, Trajectory, world_from_ned
 
 _LEAST_SHIFT_M: Final = 0.05  # Smallest allowance of a shift.
 _LEAST_TURN_RAD: Final = 0.0005  # Smallest allowance of a turn.
@@ -159,3 +163,92 @@ class MountingChange:
         turned = np.cross(np.broadcast_to(self.turn_rad, arm_body_m.shape), arm_body_m - seat.lever_body_m)
         moved = self.lever_arm_body_m + turned + self.range_scale * seat.by_scale(arm_body_m)
         return np.asarray(np.einsum("nij,nj->ni", level_from_body, moved))
+
+
+@dataclass(frozen=True)
+class Fix:
+    """Position and heading of the vehicle at one epoch."""
+
+    longitude_deg: float
+    """NaN where the trajectory lives in a local frame."""
+    latitude_deg: float
+    heading_deg: float
+    """Clockwise from true north (local frame: from its y axis), 0–360."""
+
+
+@dataclass(frozen=True)
+class Travel:
+    """Cumulative distances at a trajectory's knots."""
+
+    trajectory: Trajectory
+
+    @cached_property
+    def _knots_m(self) -> Float64:
+        steps = np.linalg.norm(np.diff(self.trajectory.position_world_m, axis=0), axis=1)
+        return np.concatenate([[0.0], np.cumsum(steps)])
+
+    def distance_m(self, epochs_gps_ns: Int64) -> Float64:
+        """Return (n,) metres travelled since the trajectory's first knot; beyond its ends, those of the ends."""
+        knots = self.trajectory.epochs_gps_ns
+        since = (epochs_gps_ns - knots[0]).astype(np.float64)
+        travelled: Float64 = np.interp(since, (knots - knots[0]).astype(np.float64), self._knots_m)
+        return travelled
+
+    def fix(self, epoch_gps_ns: int) -> Fix:
+        """Position and heading at an epoch.
+
+        Raises
+        ------
+        NavigationError
+            where there is no pose.
+        """
+        pose = self.trajectory.poses(np.array([epoch_gps_ns]), strict=True)
+        if self.trajectory.world == LOCAL_WORLD:
+            longitude = latitude = math.nan
+            world_from_ned = ENU_FROM_NED
+        else:
+            longitude, latitude = geodetic_from_world(self.trajectory.world, pose.position_world_m)[0, :2].tolist()
+            world_from_ned = ecef_from_ned(math.radians(latitude), math.radians(longitude))
+        _, _, heading = rph_from_rotation(world_from_ned.T @ pose.world_from_body[0])
+        return Fix(longitude, latitude, math.degrees(float(heading)) % 360.0)
+
+
+_STEP_M = 10.0  # Length (m) of the line to true north whose map direction gives the convergence.
+
+
+@dataclass(frozen=True)
+class LevelPoses:
+    """Poses at p epochs."""
+
+    epoch_gps_ns: Int64
+    """(p,)"""
+    body_m: Float64
+    """(p, 3) easting, northing and height of the body's origin."""
+    level_from_body: Float64
+    """(p, 3, 3) north, east, down from body axes."""
+    convergence_rad: Float64
+    """(p,) grid north is this far clockwise from true north."""
+
+    @property
+    def heading_rad(self) -> Float64:
+        """(p,) of the vehicle, clockwise from grid north."""
+        return np.asarray(
+            np.arctan2(self.level_from_body[:, 1, 0], self.level_from_body[:, 0, 0]) - self.convergence_rad
+        )
+
+
+def level_poses(trajectory: Trajectory, frame: MapFrame, epochs_gps_ns: Int64) -> LevelPoses:
+    """Return the poses of those of the epochs (n,) that have one, in their order."""
+    found = trajectory.poses(epochs_gps_ns)
+    keep = found.found
+    poses = Poses(epochs_gps_ns[keep], found.position_world_m[keep], found.world_from_body[keep], keep[keep])
+    axes = world_from_ned(trajectory.world, poses.position_world_m)
+    body = frame.map_from_world(trajectory.world, poses.position_world_m)
+    north = frame.map_from_world(trajectory.world, poses.position_world_m + _STEP_M * axes[:, :, 0])
+    away = north[:, :2] - body[:, :2]
+    return LevelPoses(
+        poses.epochs_gps_ns,
+        body,
+        np.einsum("nji,njk->nik", axes, poses.world_from_body),
+        np.asarray(-np.arctan2(away[:, 0], away[:, 1])),
+    )

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from roadscan.core.errors import ConfigError
-from roadscan.core.grid import Bounds
-from roadscan.core.ids import TileId
+from roadscan.core.grid import Bounds, TileId
 
 
 class SelectionError(ConfigError):

@@ -11,7 +11,6 @@ import numpy.typing as npt
 
 from roadscan.compute.array_types import Float64, Int64
 from roadscan.simulate.drive import Drive
-from roadscan.simulate.earth import LocalMap
 from roadscan.simulate.kernels import ground
 from roadscan.simulate.kernels import rays as kernels
 from roadscan.simulate.kernels import things as body
@@ -19,6 +18,7 @@ from roadscan.simulate.kernels.ground import CELL_M, SAMPLE_M, TILE_CELLS, TILE_
 from roadscan.simulate.kernels.road import STATION
 from roadscan.simulate.kernels.things import BODY_COLUMNS, EASTING, KIND, NORTHING, PART
 from roadscan.simulate.noise import stream
+from roadscan.simulate.path import LocalMap
 from roadscan.simulate.scene import Mount, Road, Scene
 from roadscan.simulate.surface import Surface
 from roadscan.simulate.things import Object, mover_bodies, moving_objects, objects_of

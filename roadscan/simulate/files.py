@@ -12,16 +12,15 @@ from typing import Final
 import numpy as np
 
 from roadscan.core.gpstime import gps_ns_from_utc
-from roadscan.core.imu import ImuErrors, ImuGrade
+from roadscan.core.rig import ImuErrors, ImuGrade
 from roadscan.simulate.bodies import place_at
-from roadscan.simulate.earth import Earth
 from roadscan.simulate.lidar_model import lidar_model
 from roadscan.simulate.logs import SimulatedLog
 from roadscan.simulate.noise import stream
+from roadscan.simulate.path import Earth
 from roadscan.simulate.scene import Camera, Mount, Scene
 from roadscan.simulate.sensors import sick
-from roadscan.simulate.sensors.gnss import antenna_mount
-from roadscan.simulate.sensors.imu import AT_BODY, head_imus
+from roadscan.simulate.sensors.gnss import AT_BODY, antenna_mount, head_imus
 from roadscan.simulate.sensors.lens import Lens
 from roadscan.simulate.sensors.lidar import beam_width_deg
 from roadscan.simulate.sensors.profiler import Head, heads

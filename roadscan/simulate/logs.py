@@ -13,7 +13,8 @@ from roadscan.simulate import trajectory
 from roadscan.simulate.caster import World
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.scene import ClockError, Scene
-from roadscan.simulate.sensors import bag, captures, encoder, gnss, imu, sick
+from roadscan.simulate.sensors import bag, captures, gnss, sick
+from roadscan.simulate.sensors import clock as encoder
 from roadscan.simulate.sensors.camera import write_camera
 from roadscan.simulate.sensors.clock import SensorClock
 from roadscan.simulate.sensors.picture import Studio
@@ -179,15 +180,15 @@ class Pass:
 
     def _imus(self) -> Iterator[SimulatedLog]:
         scene = self.scene
-        on_rig = [(imu.imu_of(scene), self.clock("imu", TimeSystem.GPS))] if scene.imu.on else []
-        on_rig += [(one, self.clock("profilers", TimeSystem.GPS)) for one in imu.head_imus(scene)]
+        on_rig = [(gnss.imu_of(scene), self.clock("imu", TimeSystem.GPS))] if scene.imu.on else []
+        on_rig += [(one, self.clock("profilers", TimeSystem.GPS)) for one in gnss.head_imus(scene)]
         for one, clock in on_rig:
             name = f"{one.name}.csv"
 
-            def write(one: imu.ImuOnRig = one, clock: SensorClock = clock, name: str = name) -> Iterator[int]:
-                return imu.write_imu(scene, self.drive, one, clock, self.raw / name)
+            def write(one: gnss.ImuOnRig = one, clock: SensorClock = clock, name: str = name) -> Iterator[int]:
+                return gnss.write_imu(scene, self.drive, one, clock, self.raw / name)
 
-            stated = clock.toml("ns", imu.first_gps_ns(self.drive, one))
+            stated = clock.toml("ns", gnss.first_gps_ns(self.drive, one))
             yield SimulatedLog(name, write, "other", "imu_csv", one.name, stated)
 
     def _gnss(self) -> Iterator[SimulatedLog]:

@@ -18,9 +18,9 @@ from roadscan.core.extras import need
 from roadscan.simulate import files, truth
 from roadscan.simulate.caster import World
 from roadscan.simulate.drive import Drive, drives_of
-from roadscan.simulate.earth import Earth
 from roadscan.simulate.files import CONTROL_FILE, RIG_FILE, SURVEY_FILE, control_marks, write_true_control
 from roadscan.simulate.logs import Pass, SimulatedLog
+from roadscan.simulate.path import Earth
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
 from roadscan.simulate.things import Object, objects_of

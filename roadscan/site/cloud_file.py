@@ -24,7 +24,7 @@ import numpy.typing as npt
 from roadscan.compute.array_types import Int32
 from roadscan.core.errors import StoreError
 from roadscan.core.gpstime import utc_from_gps_ns
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.georeference.cloud import TilePoints
 from roadscan.store.codecs.copc import CopcWriter, Key
 from roadscan.tiles.kernels.octree import (

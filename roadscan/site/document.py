@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, TypeAlias
+from typing import Any, ClassVar, Final, TypeAlias
 
+from roadscan.core.plugins import found_kinds
 from roadscan.run.engine.fingerprint import key_of
+from roadscan.site.material import Material
 
 _ESCAPED: Final = {ord(one): f"\\u{ord(one):04x}" for one in "<>&"}
 """Characters that could end the page element around a document."""
@@ -65,3 +69,38 @@ def plain(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return str(value)
+
+
+ENTRY_POINT_GROUP: Final = "roadscan.site_parts"
+
+
+class SitePart(ABC):
+    """Documents of one kind, and their entries in `survey.json`."""
+
+    name: ClassVar[str]
+    """Folder of its documents."""
+    position: ClassVar[int]
+    """Documents are written in ascending order of this, those that a page requests first before others."""
+
+    @abstractmethod
+    def members(self, material: Material) -> Mapping[str, Any]:
+        """Return members of `survey.json`."""
+
+    @abstractmethod
+    def documents(self, material: Material) -> Iterator[Document]:
+        """Yield all documents; expensive content is made when a document is written."""
+
+    def listed(self, material: Material) -> Iterator[Document]:
+        """Yield the documents that a server lists at its start; :meth:`find` knows the others."""
+        return self.documents(material)
+
+    def find(self, material: Material, path: str) -> Document | None:
+        """Return one document by its path below `name`; for a part with too many documents to list."""
+        return None
+
+
+@functools.cache
+def site_parts() -> tuple[SitePart, ...]:
+    """Return all parts, in the order in which they are written."""
+    known = found_kinds("site/parts/*.py", SitePart, ENTRY_POINT_GROUP)
+    return tuple(sorted((kind() for kind in known.values()), key=lambda p: (p.position, p.name)))

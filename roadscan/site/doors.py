@@ -18,12 +18,10 @@ from roadscan.inventory.homes.page_edits import PageDocument
 from roadscan.inventory.of_survey import page_document, truth_of
 from roadscan.measuring.measure import Measured, length_of, measure, meet, picture_number, posed_pictures
 from roadscan.measuring.words import geojson_of, place_rows
-from roadscan.pictures.clicked import FILE, ClickedPoints
-from roadscan.pictures.points import control_rows, measured_points
+from roadscan.pictures.points import FILE, ClickedPoints, control_rows, measured_points
 from roadscan.run.session import Session
 from roadscan.site.live import LiveSite
-from roadscan.site.parts.edits import POST
-from roadscan.site.parts.measuring import CONTROL, MEASURE, has_control
+from roadscan.site.parts.edits import CONTROL, MEASURE, POST, has_control
 from roadscan.site.server import Door
 from roadscan.site.where import pictures_of_place
 

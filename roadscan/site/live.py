@@ -13,9 +13,8 @@ from typing import Final, NamedTuple
 from roadscan.core.errors import RoadscanError
 from roadscan.inventory.of_survey import truth_of
 from roadscan.run.session import Session
-from roadscan.site.document import Document
+from roadscan.site.document import Document, site_parts
 from roadscan.site.material import Material, Wishes
-from roadscan.site.part import site_parts
 from roadscan.site.site import ENTRY, first_documents
 from roadscan.store.asset_truth import COMMITS
 from roadscan.store.store import Store

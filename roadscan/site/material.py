@@ -14,7 +14,7 @@ import pyarrow as pa
 import shapely
 
 from roadscan.core.errors import ConfigError, DamagedError, nearest
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.georeference.plan.plan import SurveyPlan, plan_of
 from roadscan.inventory.of_survey import truth_of
 from roadscan.inventory.state import State

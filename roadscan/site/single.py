@@ -9,11 +9,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from roadscan.core.errors import ConfigError
-from roadscan.site.material import Material
+from roadscan.core.errors import ConfigError, RoadscanError
+from roadscan.run.session import Session
+from roadscan.site.material import Material, Wishes
 from roadscan.site.site import KEYS, REPORT_PAGE, publish
-from roadscan.site.web_part import DATA_MARK, single_page
-from roadscan.store.holding.beside import beside
+from roadscan.site.web_part import DATA_MARK, HOW_TO_BUILD, single_page, web_folder
+from roadscan.store.holders import beside
 
 LARGEST_MB: Final = 200.0
 """Larger pages open slowly in browsers."""
@@ -130,3 +131,21 @@ def _write(path: Path, page: str, folder: Path) -> None:
 def _without_report(content: bytes) -> bytes:
     """Return a document without the path of the report, which is a separate page."""
     return content.replace(f'"report":"{REPORT_PAGE}"'.encode(), b'"report":null')
+
+
+PAGE: Final = "page.html"
+_FINEST_M: Final = 0.02
+"""Finest pixel (m), so that the file takes seconds; finer pixels and the points are for `roadscan view`."""
+
+
+def page_lines(survey_file: Path) -> list[str]:
+    """Return the last lines of a run: the address of its page, or why there is none and how to get it."""
+    how = f"roadscan view {survey_file}"
+    if web_folder() is None:
+        return [f"look at it    {how}", f"              the page is not built yet: {HOW_TO_BUILD}"]
+    file = survey_file.parent / PAGE
+    try:
+        write_single(Material(Session.open(survey_file), Wishes(clouds=False, finest_pixel_m=_FINEST_M)), file)
+    except RoadscanError as error:
+        return [f"look at it    {how}", f"              its file could not be made: {error}"]
+    return [f"look at it    {file.resolve().as_uri()}", f"with points   {how}"]

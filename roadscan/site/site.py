@@ -17,16 +17,15 @@ from roadscan.core.crs import MapFrame, crs_from_text
 from roadscan.core.errors import ConfigError, RoadscanError
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
-from roadscan.site.document import Ask, Document, json_document
+from roadscan.site.document import Ask, Document, json_document, site_parts
 from roadscan.site.material import SHEET_M, Box, Material
-from roadscan.site.part import site_parts
 from roadscan.site.parts.catalog import from_longitude_latitude, to_longitude_latitude
 from roadscan.site.parts.vectors import site_layers
 from roadscan.site.report_copy import REPORT, linked_report
 from roadscan.site.web_part import web_documents
 from roadscan.store.codecs import SOFTWARE
 from roadscan.store.digest import checked_json, file_digest, parse_checked
-from roadscan.store.holding.beside import beside, put_folder
+from roadscan.store.holders import beside, put_folder
 from roadscan.store.manifest import read_recorded
 
 LAYOUT: Final = 1  # version of the site's layout

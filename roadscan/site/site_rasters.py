@@ -18,8 +18,7 @@ import numpy.typing as npt
 
 from roadscan.compute.array_types import Float32
 from roadscan.core.errors import StoreError
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileGrid, TileId
 from roadscan.core.strict import Strict
 from roadscan.tiles.product import LoadCells, TileSummary
 from roadscan.tiles.products.hillshade import HillshadeOptions, shade

@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.errors import ConfigError
-from roadscan.core.grid import Bounds
-from roadscan.core.ids import TileId
+from roadscan.core.grid import Bounds, TileId
 from roadscan.georeference.plan.plan import plan_of, poses_plan_of
 from roadscan.measuring.measure import pixel_covariance, posed_pictures
 from roadscan.pictures.views import PictureRule, sights

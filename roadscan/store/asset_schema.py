@@ -11,7 +11,7 @@ from typing import Any, Final, Literal, TypeAlias
 import pyarrow as pa
 
 from roadscan.core.errors import SchemaError, nearest
-from roadscan.store.schema import schema_folders
+from roadscan.store.schema import schema_folders, table_schema
 
 GeometryType: TypeAlias = Literal["PointZ", "LineStringZ", "PolygonZ", "MultiLineStringZ", "MultiPolygonZ"]
 
@@ -154,3 +154,47 @@ def _columns(raw: dict[str, Any]) -> tuple[AssetColumn, ...]:
     return tuple(
         AssetColumn(**c | {name: tuple(c[name]) for name in lists if name in c}) for c in raw.get("columns", ())
     )
+
+
+GEOMETRY: Final = "geometry"
+
+EDITED_BY_PEOPLE: Final = frozenset(
+    {"status", "condition", "comments", "parent", "valid_from", "valid_to", "road", "station_m", "offset_m", "lane"}
+)
+"""Columns of all kinds that people may change, beside the kind's specific columns and the geometry."""
+
+
+@functools.cache
+def kinds_by_table() -> dict[str, str]:
+    """Return the kind of each table by name."""
+    return {asset_schema(kind).table: kind for kind in asset_kind_names()}
+
+
+@functools.cache
+def asset_columns(kind: str) -> tuple[AssetColumn, ...]:
+    """Return the columns of a kind's table without the geometry: the inventory's, the kind's, the common ones."""
+    schema = asset_schema(kind)
+    return (*inventory_columns(), *schema.own, *schema.common)
+
+
+@functools.cache
+def editable_columns(kind: str) -> frozenset[str]:
+    """Return the columns of a kind that people may change, without the geometry and those about its evidence."""
+    return EDITED_BY_PEOPLE | {c.name for c in asset_schema(kind).own if not c.is_evidence}
+
+
+@functools.cache
+def asset_table(kind: str) -> pa.Schema:
+    """Return the Arrow schema of a kind's inventory table; all columns may be null, the geometry (WKB) is last."""
+    fields = [c.field().with_nullable(True) for c in asset_columns(kind)]
+    return pa.schema([*fields, pa.field(GEOMETRY, pa.binary())])
+
+
+@functools.cache
+def evidence_table() -> pa.Schema:
+    """Return the Arrow schema of the table `assets_found`: its specific columns and those of all kinds."""
+    fields = {field.name: field for field in table_schema("assets_found").arrow()}
+    for kind in asset_kind_names():
+        for field in asset_table(kind):
+            fields.setdefault(field.name, field.remove_metadata())
+    return pa.schema([fields.pop("commit"), *fields.values()])

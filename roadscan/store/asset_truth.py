@@ -23,10 +23,9 @@ from typing import Final, Literal, TypeAlias
 import pyarrow as pa
 
 from roadscan.core.errors import DamagedError, StoreError
-from roadscan.store.digest import bytes_digest, bytes_hold, checked_json, parse_checked
-from roadscan.store.inventory_schema import evidence_table
+from roadscan.store.asset_schema import evidence_table
+from roadscan.store.digest import bytes_digest, bytes_hold, checked_json, parse_checked, sealed_parquet
 from roadscan.store.schema import table_schema
-from roadscan.store.seal import sealed_parquet
 from roadscan.store.store import Store
 
 try:

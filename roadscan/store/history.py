@@ -8,8 +8,8 @@ from typing import Any, Final
 import pyarrow as pa
 
 from roadscan.core.errors import DamagedError, StoreError
+from roadscan.store.digest import bears_seal, sealed_parquet
 from roadscan.store.schema import table_schema
-from roadscan.store.seal import bears_seal, sealed_parquet
 from roadscan.store.store import Store
 
 TABLE: Final = "run_history"

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from pydantic_core import from_json
 
 from roadscan.store.damage import UNREADABLE
-from roadscan.store.seal import check_seal, sealed_parquet, without_seal
+from roadscan.store.digest import check_seal, sealed_parquet, without_seal
 
 RECORDS: Final = pa.schema(
     [

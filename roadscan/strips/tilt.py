@@ -18,7 +18,7 @@ import numpy as np
 from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.robust import scatter_about
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.poses.level import LevelPoses
+from roadscan.poses.movement import LevelPoses
 
 Angle = Literal["roll", "pitch"]
 

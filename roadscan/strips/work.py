@@ -16,15 +16,14 @@ from roadscan.adjust.tasks.near import PlacedReadings, placed_readings
 from roadscan.compute.robust import scatter_about
 from roadscan.compute.ways import way_along
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.footprints.footprints import PRODUCT as FOOTPRINTS
 from roadscan.footprints.footprints import footprints_of
 from roadscan.georeference.plan.plan import SurveyPlan, plan_of
 from roadscan.georeference.plan.road import road_key
 from roadscan.georeference.sources import READING_COLUMNS, Georeferencer, MapSettings, RawSlice, geometry_of, read_rows
-from roadscan.navigation.tasks.pose_sigma import median_pose_sigma
-from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded
-from roadscan.poses.level import level_poses
+from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded, median_pose_sigma
+from roadscan.poses.movement import level_poses
 from roadscan.poses.trajectory import Trajectory
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.bundles import run_bundles

@@ -17,7 +17,7 @@ lines, as in Nieminen, Heinonen and Neuvo (1987), "A new class of detail-preserv
    `outlier_sigmas`, so that outliers have little weight.
 5. *Support*: a crack 20 cells wide could be smoothed more than by a line of seven, one cell wide at a bend less. So
    on detail there are means of 3 and of 13 cells along the line and paraboloids over 7 × 7 and 9 × 9 besides
-   (outliers replaced by the line's median), and of all that of least risk (``surface/kernels/supports.py``).
+   (outliers replaced by the line's median), and of all that of least risk (``surface/kernels/line_medians.py``).
 6. *Strips*: a crack too shallow for lines of seven may show over 21 cells (``faint_cracks.py``). Its cells
    are detail as well, and the strip is a sixth support.
 7. *Level ground*: the median of seven in a row, of seven such in a column, side by side; of these the mean of 7 × 7,
@@ -40,14 +40,18 @@ from roadscan.surface.faint_cracks import REACH as STRIP_REACH
 from roadscan.surface.faint_cracks import Chains, no_strips
 from roadscan.surface.kernels.line_medians import (
     CELLS,
+    SUPPORTS,
+    CrackCells,
+    Shapes,
+    heights_by_support,
     judge_lines,
     keep_better,
+    least_risk,
     line_means,
     line_medians,
     mirrored_line_medians,
     window_sums,
 )
-from roadscan.surface.kernels.supports import SUPPORTS, CrackCells, Shapes, heights_by_support, least_risk
 from roadscan.surface.settings import SurfaceSmoothing
 
 _ABSENT = np.inf

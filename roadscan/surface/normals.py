@@ -43,8 +43,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.surface.kernels.delaunay import MOST, MOST_RINGS, neighbourhoods
 from roadscan.surface.kernels.spline_gradients import FITTED, LEVEL, WORK, spline_gradients, vertex_gradients
-from roadscan.surface.kernels.vertex_neighbourhoods import MOST, MOST_RINGS, neighbourhoods
 from roadscan.surface.settings import SlopeKind
 from roadscan.surface.sites import Sites
 from roadscan.surface.triangulation import Triangulation

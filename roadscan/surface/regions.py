@@ -10,6 +10,22 @@ A patch stands out where its roughness exceeds `factor` times that and `least_m`
 box along and across the road, padded, is its outline.
 
 Patches and sections are counted from multiples of their length along the stretch.
+
+Coarse reconstruction: the profiles of a stretch of road are resampled to an even grid, profile by profile.
+
+Along each profile a cubic spline runs through its road readings and is read off at even steps across the road; holes
+up to a stated width are filled; a 3 × 3 median removes impulses (Yu and others 2007, 3.2.3). "Gridding and
+interpolation is on individual profiles and not on the entire surface": rows of the grid are the profiles themselves,
+at whatever distance the vehicle drove between them.
+
+- **Knots** are the readings; where several lie nearest to one node of the grid, their mean, so that a profiler's dense
+  readings are averaged rather than sampled. Between knots runs the natural cubic spline.
+- **Holes** are gaps in which readings are missing (no return, not road). Splines end at them, because a
+  cubic across a hole swings with the noise at its rims. Holes up to `fill_m` are filled by the straight line
+  between the mean heights of the last three knots on each side. A gap between neighbouring readings is no hole,
+  but the scanner's spacing; wider than `reach_m` it is left empty.
+- **Origins**: `measured`, a knot lies nearest to this node; `interpolated`; `filled`; or nothing.
+- The **median** is that of the nodes there are. It keeps origins.
 """
 
 from __future__ import annotations
@@ -21,11 +37,196 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 import shapely
+from pydantic import Field
 
-from roadscan.compute.array_types import Bool, Float64
-from roadscan.surface.coarse import CoarseModel
+from roadscan.compute.array_types import Bool, Float64, UInt8
+from roadscan.compute.ways import way_along
+from roadscan.core.grid import QUANTA_PER_M, TileGrid, TileId
+from roadscan.core.strict import Strict
+from roadscan.surface.kernels import coarse as kernels
 from roadscan.surface.kernels.coarse import PATCH_SUMS, sum_patches
 from roadscan.surface.settings import RegionSettings
+
+NOTHING: Final = kernels.NOTHING
+MEASURED: Final = kernels.MEASURED
+INTERPOLATED: Final = kernels.INTERPOLATED
+FILLED: Final = kernels.FILLED
+ORIGINS: Final = {NOTHING: "nothing", MEASURED: "measured", INTERPOLATED: "interpolated", FILLED: "filled"}
+"""Name of each origin of a node or cell."""
+
+
+class CoarseSettings(Strict):
+    """Settings of the coarse model."""
+
+    spacing_m: float = Field(default=0.01, gt=0.0005, le=1.0)
+    """Step across the road (m); the paper's is 1 cm."""
+    reach_m: float = Field(default=0.5, gt=0.0)
+    """Widest gap between neighbouring readings that the spline crosses (m)."""
+    fill_m: float = Field(default=0.3, ge=0.0)
+    """Widest hole that is filled (m)."""
+    every: int = Field(default=1, ge=1, le=16)
+    """From one measured reading of a profile to the next: 2 for a mirror that measures every second one a turn."""
+    link_m: float = Field(default=0.5, gt=0.0)
+    """Profiles farther apart bound no surface between them (m)."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """Profiles of one stretch of road, in the order driven."""
+
+    along_m: Float64
+    """(n,) position along the stretch, ascending."""
+    across_m: Float64
+    """(n, m) offset of each reading, right positive."""
+    height_m: Float64
+    """(n, m) in the map frame."""
+    classes: UInt8
+    """(n, m), 0 the road (``points.classes``); other readings are ignored."""
+    zero_m: Float64
+    """(n, 2) easting and northing of each profile's offset 0."""
+    right: Float64
+    """(n, 2) unit vector of the map along each profile, to the right."""
+
+    @classmethod
+    def of_points(
+        cls, easting_m: Float64, northing_m: Float64, height_m: Float64, classes: UInt8, path_m: Float64
+    ) -> Stretch:
+        """Returns profiles from positions on the map.
+
+        Each profile is a straight line on the map: the least-squares line of its road readings; offset 0 is the foot
+        of the sensor on it, so that neighbouring profiles of a straight drive share their offsets.
+
+        Parameters
+        ----------
+        easting_m, northing_m, height_m, classes : (n, m), of the readings; places count where the class is 0 only.
+        path_m : (n, 2) easting and northing of the sensor. Which end of the profiles is the right one is decided once
+        for all, by the path as a whole: a vehicle that stands has no direction.
+        """
+        along: Float64 = way_along(path_m)
+        drive = np.gradient(path_m, axis=0) if len(path_m) > 1 else np.zeros_like(path_m)
+        road = classes == 0
+        count = np.maximum(road.sum(axis=1, keepdims=True), 1)
+        middle = np.concatenate(
+            [np.where(road, c, 0.0).sum(axis=1, keepdims=True) / count for c in (easting_m, northing_m)], axis=1
+        )
+        e = np.where(road, easting_m - middle[:, :1], 0.0)
+        n = np.where(road, northing_m - middle[:, 1:], 0.0)
+        angle = 0.5 * np.arctan2(2.0 * (e * n).sum(axis=1), (e * e).sum(axis=1) - (n * n).sum(axis=1))
+        right = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        number = np.arange(classes.shape[1]) - (classes.shape[1] - 1) / 2.0
+        right *= np.where((e @ number) * right[:, 0] + (n @ number) * right[:, 1] < 0.0, -1.0, 1.0)[:, None]
+        if (right[:, 0] * drive[:, 1] - right[:, 1] * drive[:, 0]).sum() < 0.0:
+            right *= -1.0
+        foot = ((path_m - middle) * right).sum(axis=1, keepdims=True)
+        zero = middle + foot * right
+        across = e * right[:, :1] + n * right[:, 1:] - foot
+        return cls(along, across, np.ascontiguousarray(height_m, np.float64), classes, zero, right)
+
+
+@dataclass(frozen=True)
+class CoarseModel:
+    """The coarse surface of one stretch."""
+
+    settings: CoarseSettings
+    along_m: Float64
+    """(n,) of the profiles."""
+    zero_m: Float64
+    """(n, 2) easting and northing of offset 0."""
+    right: Float64
+    """(n, 2) unit vector to the right."""
+    first_node: int
+    """Number of the first node: node k lies at the offset (first_node + k) · spacing_m."""
+    spline_m: Float64
+    """(n, K) heights as interpolated, NaN where there is none."""
+    height_m: Float64
+    """(n, K) heights after the median filter."""
+    origin: UInt8
+    """(n, K), of :data:`ORIGINS`."""
+
+    @property
+    def across_m(self) -> Float64:
+        """Returns offsets (K,) of the nodes (m)."""
+        return np.asarray((self.first_node + np.arange(self.height_m.shape[1])) * self.settings.spacing_m)
+
+    def places_m(self) -> tuple[Float64, Float64]:
+        """Returns easting and northing of the nodes, (n, K) each."""
+        across = self.across_m
+        return (
+            self.zero_m[:, :1] + across * self.right[:, :1],
+            self.zero_m[:, 1:] + across * self.right[:, 1:],
+        )
+
+    def tile_cells(self, tile: TileId, grid: TileGrid) -> TileSurface:
+        """Returns the surface on the cells of a tile of the map: the mean of the nodes in each.
+
+        Between two profiles it is linear along the road, so cells that lie between profiles are filled. Heights
+        are summed as whole 10 µm: a cell has the same bits whatever stretch of road is given with it, if the profiles
+        that touch it and their neighbours are.
+        """
+        box, edge = grid.bounds(tile), grid.cells_per_edge
+        rows = self._near(box.easting_min_m, box.northing_min_m, grid.size_m)
+        sums, counts = np.zeros((edge, edge), np.int64), np.zeros((edge, edge), np.int32)
+        origin = np.zeros((edge, edge), np.uint8)
+        links = np.append(np.hypot(*np.diff(self.zero_m[rows], axis=0).T) <= self.settings.link_m, False)
+        east, north, right_east, right_north = (
+            np.ascontiguousarray(column) for column in (*self.zero_m[rows].T, *self.right[rows].T)
+        )
+        profiles = kernels.Profiles(
+            east, north, right_east, right_north, self.first_node, self.settings.spacing_m, self.height_m[rows],
+            self.origin[rows], links,
+        )  # fmt: skip
+        kernels.rasterise(
+            profiles, (box.easting_min_m, box.northing_min_m), grid.size_m / edge, 1.5 * edge / grid.size_m,
+            float(QUANTA_PER_M), kernels.CellSums(sums, counts, origin),
+        )  # fmt: skip
+        with np.errstate(invalid="ignore", divide="ignore"):
+            height: Float64 = np.where(counts > 0, sums / counts / QUANTA_PER_M, np.nan)
+        return TileSurface(tile, height, origin, counts)
+
+    def _near(self, west_m: float, south_m: float, size_m: float) -> slice:
+        """Returns the profiles, first to last, whose line may touch a square, with a neighbour on each side."""
+        across = self.across_m
+        if not across.size or not self.along_m.size:
+            return slice(0, 0)
+        ends = [self.zero_m + t * self.right for t in (across[0], across[-1])]
+        low, high = np.minimum(*ends), np.maximum(*ends)
+        corner = np.array([west_m, south_m])
+        touch = np.flatnonzero(((high >= corner) & (low <= corner + size_m)).all(axis=1))
+        return slice(max(int(touch[0]) - 1, 0), int(touch[-1]) + 2) if touch.size else slice(0, 0)
+
+
+@dataclass(frozen=True)
+class TileSurface:
+    """The coarse surface on the cells of one tile; arrays are (edge, edge), rows from south to north."""
+
+    tile: TileId
+    height_m: Float64
+    """NaN where there is none."""
+    origin: UInt8
+    """The best origin of the nodes in a cell, of :data:`ORIGINS`."""
+    count: npt.NDArray[np.int32]
+    """Number of nodes in a cell."""
+
+
+def coarse_model(stretch: Stretch, settings: CoarseSettings) -> CoarseModel:
+    """Returns the coarse surface of a stretch; a node depends only on its profile and the two beside it."""
+    road = stretch.classes == 0
+    across = stretch.across_m[road]
+    first, end = 0, 0
+    if across.size:
+        first = int(np.floor(across.min() / settings.spacing_m + 0.5))
+        end = int(np.floor(across.max() / settings.spacing_m + 0.5)) + 1
+    surface = np.empty((stretch.along_m.size, end - first))
+    origin = np.empty(surface.shape, np.uint8)
+    kernels.spline_profiles(
+        np.ascontiguousarray(stretch.across_m), np.ascontiguousarray(stretch.height_m),
+        np.ascontiguousarray(stretch.classes), settings.every, first, settings.spacing_m, settings.reach_m,
+        settings.fill_m, surface, origin,
+    )  # fmt: skip
+    height = np.empty_like(surface)
+    kernels.median_filter(surface, height)
+    return CoarseModel(settings, stretch.along_m, stretch.zero_m, stretch.right, first, surface, height, origin)
+
 
 FOUND: Final = "found"
 STATED: Final = "stated"

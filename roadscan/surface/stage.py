@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.footprints.footprints import footprints_of
 from roadscan.georeference.plan.plan import SurveyPlan, plan_of
 from roadscan.run.session import Session
@@ -20,12 +20,14 @@ from roadscan.surface.tasks.found_regions import (
     load_found_regions,
     searched_sources,
 )
-from roadscan.surface.tasks.surface_colours import check_colours, colour_notes, plan_colours
 from roadscan.surface.tasks.surface_plan import (
     SURFACE,
     SurfacePlan,
+    check_colours,
     checked_surface,
+    colour_notes,
     files_without_surface,
+    plan_colours,
     plan_surfaces,
 )
 from roadscan.surface.tasks.surfaces import compute_surfaces

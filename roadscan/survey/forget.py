@@ -16,7 +16,7 @@ from roadscan.core.errors import ConfigError, DamagedError, RoadscanError, neare
 from roadscan.core.gpstime import now_utc
 from roadscan.ingest.planned_logs import PlannedLog, logs_of
 from roadscan.ingest.sources import listed_name
-from roadscan.navigation.tasks.taken_pictures import taken_pictures
+from roadscan.navigation.tasks.recorded_pictures import taken_pictures
 from roadscan.run.session import Session
 from roadscan.store.codecs.image_files import SUFFIXES
 from roadscan.store.logs import read_log_records

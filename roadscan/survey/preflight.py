@@ -40,15 +40,23 @@ from roadscan.core.witness import Witness
 from roadscan.georeference.place import CloudFrame
 from roadscan.georeference.plan.centre_line import CentreLines, load_buffer
 from roadscan.georeference.plan.road import looks_across
-from roadscan.ingest.first_look import LookedAt, key_of_look, look_at, named, never_meeting
+from roadscan.ingest.epoch_order import one_stamp_logs
 from roadscan.ingest.inspect.diagnosis import cannot_be_opened, claimed_format, is_there
-from roadscan.ingest.one_stamp import one_stamp_logs
-from roadscan.ingest.overlap import Fault, NothingPlacedError, no_row
+from roadscan.ingest.overlap import (
+    Fault,
+    LookedAt,
+    NothingPlacedError,
+    key_of_look,
+    look_at,
+    named,
+    never_meeting,
+    no_row,
+)
 from roadscan.ingest.place_checks import without_fix
 from roadscan.ingest.planned_logs import CONTROL_RUN, log_options, log_source, plan_logs
 from roadscan.ingest.reading.format import LogFormat, LogHeader, LogSource, Reject, Rows, format_alone
 from roadscan.ingest.sources import claimed_before, listed_name, remembered_logs
-from roadscan.navigation.odometry.registration import LIBRARY, WHAT
+from roadscan.navigation.odometry import LIBRARY, WHAT
 from roadscan.navigation.tasks.clocks import check_clocks
 from roadscan.navigation.tasks.navigation_logs import unknown_imu, unknown_way
 from roadscan.navigation.tasks.odometry_trajectory import LOCAL_MAP
@@ -59,8 +67,7 @@ from roadscan.store.logs import has_log, read_log_records
 from roadscan.store.store import Store
 from roadscan.surface.settings import SurfaceConfig
 from roadscan.surface.tasks.found_regions import none_across
-from roadscan.surface.tasks.surface_colours import check_cameras
-from roadscan.surface.tasks.surface_plan import checked_surface
+from roadscan.surface.tasks.surface_plan import check_cameras, checked_surface
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.tasks.wanted_products import check_product, wanted_surface_products, wanted_tile_products
 

@@ -18,13 +18,13 @@ from roadscan.run.selection import SelectionError
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, findings_of, stages
 from roadscan.run.told import told_run, told_stage
-from roadscan.store.holding.look import look_again
+from roadscan.store.holders import look_again
 from roadscan.store.logs import read_log_records
 from roadscan.store.manifest import begin_changes, end_changes, write_failures
 from roadscan.store.small_tables import digests_fault
 from roadscan.store.verified import note_written, recorded_files, repair_records
 from roadscan.store.written_by import VERSION_FILE, version_content
-from roadscan.surface.tasks.surface_colours import check_cameras
+from roadscan.surface.tasks.surface_plan import check_cameras
 from roadscan.survey.status import survey_status
 from roadscan.tiles.tasks.wanted_products import wanted_products
 

@@ -10,8 +10,7 @@ import numpy.typing as npt
 
 from roadscan.compute.kernels.height_slots import LANES, SLOT_HEIGHTS, SLOT_SIZE, VECTOR
 from roadscan.core.errors import RoadscanError
-from roadscan.core.grid import QUANTUM_M, TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import QUANTUM_M, TileGrid, TileId
 from roadscan.georeference.kernels.readings import FATES
 from roadscan.run.memory import MOST_CELL_BYTES
 from roadscan.tiles.cells import TileCells, TileEvidence

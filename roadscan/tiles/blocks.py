@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 
 
 @dataclass(frozen=True)

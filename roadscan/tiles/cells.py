@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 
 
 @dataclass(frozen=True)

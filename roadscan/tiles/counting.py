@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from roadscan.compute.array_types import Int32, Int64
 from roadscan.core.scan_geometry import ScanGeometry
-from roadscan.georeference.flat_profiles import flat_profiles
+from roadscan.georeference.charts import flat_profiles
 from roadscan.georeference.kernels.flat_profiles import FlatProfiles
 from roadscan.georeference.kernels.readings import Georeference, MirrorProfiles, Returns
 from roadscan.georeference.kernels.timed_readings import CHUNK

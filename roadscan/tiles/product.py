@@ -18,8 +18,7 @@ from typing import ClassVar, Final, Literal, Protocol, Self, TypeAlias
 
 from roadscan.core.crs import MapFrame
 from roadscan.core.errors import ConfigError, nearest
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import LanePass, TileId
+from roadscan.core.grid import LanePass, TileGrid, TileId
 from roadscan.core.plugins import found_kinds
 from roadscan.core.strict import Strict
 from roadscan.georeference.cloud import TilePoints

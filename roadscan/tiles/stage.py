@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
 from roadscan.footprints.footprints import PRODUCT as FOOTPRINTS

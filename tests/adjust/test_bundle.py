@@ -12,16 +12,15 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.adjust.adjustment import Adjustment, adjust
 from roadscan.adjust.bundle.measurements import Measurements, Numbers, State, met_at, residuals_px, rows_of, seen
-from roadscan.adjust.bundle.self_check import FreeCameras, free_cameras
+from roadscan.adjust.bundle.outcome import FreeCameras, free_cameras
 from roadscan.adjust.bundle.solve import Approached, PictureEvidence, approached, state_of
 from roadscan.adjust.observations import CAMERA, Observations
 from roadscan.adjust.process import CameraPrior, GaussMarkov, MountingPrior, RunPrior
-from roadscan.adjust.solver_settings import AdjustmentSettings
-from roadscan.core.camera import Interior
+from roadscan.adjust.settings import AdjustmentSettings
 from roadscan.core.crs import LOCAL_WORLD
 from roadscan.core.frames import ENU_FROM_NED
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.core.rig import Sensor
+from roadscan.core.rig import Interior, Sensor
 from roadscan.pictures.exposures import Camera, Exposures
 from roadscan.pictures.lens import pixels_of
 from roadscan.pictures.views import Lens

@@ -22,9 +22,9 @@ from roadscan.adjust.bundle.measurements import Rows, met_at, seen
 from roadscan.adjust.bundle.solve import PictureEvidence, approached, state_of
 from roadscan.adjust.observations import CAMERA, Observations
 from roadscan.adjust.process import CameraPrior, MountingPrior
-from roadscan.adjust.solver_settings import AdjustmentSettings
-from roadscan.core.camera import Interior
+from roadscan.adjust.settings import AdjustmentSettings
 from roadscan.core.frames import ENU_FROM_NED
+from roadscan.core.rig import Interior
 from roadscan.pictures.lens import pixels_of
 from roadscan.pictures.views import Lens
 from tests.adjust.test_bundle import LENS, Block, Drive, simulated_drive

@@ -7,11 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from roadscan.adjust.control.control import ControlPoint, moved_m, observations_of, passes_by, sight
-from roadscan.adjust.control.control_faults import WrongPoint, datum_fault, far_in_height, swapped
+from roadscan.adjust.control import (
+    ControlPoint,
+    WrongPoint,
+    datum_fault,
+    far_in_height,
+    moved_m,
+    observations_of,
+    passes_by,
+    sight,
+    swapped,
+)
 from roadscan.adjust.patches import PassReadings
 from roadscan.adjust.places import Track
-from roadscan.adjust.targets.settings import TargetSettings
+from roadscan.adjust.settings import TargetSettings
 from roadscan.adjust.tasks.publication import left_after
 from roadscan.core.frames import rotation_from_rph
 from roadscan.poses.trajectory import Corrections
@@ -80,7 +89,7 @@ def test_a_point_without_a_target_gives_its_height_along_the_normal() -> None:
 
 
 def test_a_picked_place_gives_two_components_of_one_group() -> None:
-    from roadscan.adjust.control.control import PickedPlace
+    from roadscan.adjust.control import PickedPlace
 
     one = sight(POINT, [readings()], TARGETS, 0.02, PickedPlace(1000.02, 1999.99, 0.004))
     assert one.status == "picked"

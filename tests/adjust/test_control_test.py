@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from roadscan.adjust.adjustment import AdjustmentSettings
-from roadscan.adjust.control.control_test import SurveyErrors, judged
+from roadscan.adjust.control_test import SurveyErrors, judged
 
 SHIFT_M = np.array([0.1, 0.36])
 

@@ -15,7 +15,7 @@ from roadscan.adjust.bundle.measurements import State, met_at, seen
 from roadscan.adjust.bundle.solve import Approached, approached, state_of
 from roadscan.adjust.observations import Observations
 from roadscan.adjust.process import MountingPrior
-from roadscan.adjust.solver_settings import AdjustmentSettings
+from roadscan.adjust.settings import AdjustmentSettings
 from roadscan.poses.trajectory import Corrections
 from tests.adjust import test_bundle
 from tests.adjust.test_bundle import BORESIGHT_RAD, Block, Drive, simulated_drive

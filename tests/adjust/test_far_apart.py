@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.tie_settings import AgainSettings, TieSettings
-from roadscan.adjust.ties.far_apart import agreeing
-from roadscan.adjust.ties.tie import SHIFT
+from roadscan.adjust.settings import AgainSettings, TieSettings
+from roadscan.adjust.ties.tie import SHIFT, agreeing
 
 AHEAD = np.array([0.87, -0.49]) / np.hypot(0.87, 0.49)
 """North and east of the road's direction."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from roadscan.adjust.control.control import ControlPoint, Sighting
+from roadscan.adjust.control import ControlPoint, Sighting
 from roadscan.adjust.helmert import helmert, rigid_fit
 from roadscan.core.errors import ConfigError
 from roadscan.core.frames import ENU_FROM_NED

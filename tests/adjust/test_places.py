@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from roadscan.adjust.places import Place, Track, places_of_overlap
-from roadscan.adjust.tie_settings import PlaceSettings
+from roadscan.adjust.settings import PlaceSettings
 from roadscan.core.errors import NavigationError
 
 SPEED = 25.0

@@ -12,8 +12,7 @@ from roadscan.adjust.observations import COMMON, KINDS, Observations
 from roadscan.adjust.patches import PassReadings
 from roadscan.adjust.places import Place, Traverse
 from roadscan.adjust.process import GaussMarkov, RunPrior
-from roadscan.adjust.solver_settings import AdjustmentSettings
-from roadscan.adjust.tie_settings import TieSettings
+from roadscan.adjust.settings import AdjustmentSettings, TieSettings
 from roadscan.adjust.ties.at_place import Ties, ties_at
 
 PLACE = Place(0, 1000.0, 2000.0, 0.0, 8.0, (Traverse(0, "lidar", 0, 10**10),))

@@ -8,7 +8,7 @@ import pytest
 from roadscan.adjust.adjustment import adjust
 from roadscan.adjust.observations import Observations
 from roadscan.adjust.process import GaussMarkov, RunPrior, StatedSigma, knots_of, line_variance, precision_of
-from roadscan.adjust.solver_settings import AdjustmentSettings
+from roadscan.adjust.settings import AdjustmentSettings
 from roadscan.core.errors import ConfigError
 
 PROCESS = GaussMarkov(0.015, 120.0)

@@ -16,15 +16,23 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
 from roadscan.adjust.adjustment import adjust
-from roadscan.adjust.bundle.edge_boresight import EdgeBoresight, Sighted, boresight_of, edge_observations, widened
-from roadscan.adjust.bundle.range_edges import OTHERS, EdgeScores, scores_of
+from roadscan.adjust.bundle.edge_boresight import (
+    OTHERS,
+    EdgeBoresight,
+    EdgeScores,
+    Sighted,
+    boresight_of,
+    edge_observations,
+    scores_of,
+    widened,
+)
 from roadscan.adjust.bundle.solve import approached
 from roadscan.adjust.kernels.range_edges import continued, scores_of_turns
 from roadscan.adjust.observations import Observations
 from roadscan.adjust.process import CameraPrior, GaussMarkov, MountingPrior, RunPrior
-from roadscan.adjust.solver_settings import AdjustmentSettings
+from roadscan.adjust.settings import AdjustmentSettings
 from roadscan.adjust.tasks.edge_scores import boresight_findings
-from roadscan.core.camera import Interior
+from roadscan.core.rig import Interior
 from roadscan.pictures.views import Lens
 from tests.adjust.test_bundle import BORESIGHT_RAD, Block, simulated_drive
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.adjust.tasks.seams import moved, seam_view
-from roadscan.adjust.tie_settings import TieSettings
+from roadscan.adjust.settings import TieSettings
+from roadscan.adjust.tasks.outcome import moved, seam_view
 from roadscan.poses.trajectory import Corrections
 from tests.adjust.drawn_patches import PLACE, Seen, edge_line, readings
 from tests.adjust.test_ties import moved as moved_in_full

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from roadscan.adjust.settings import TargetSettings
 from roadscan.adjust.targets.line import find_line
-from roadscan.adjust.targets.settings import TargetSettings
-from roadscan.adjust.targets.shapes import SurveyedLine
-from roadscan.adjust.targets.values import TargetReadings
+from roadscan.adjust.targets.shapes import SurveyedLine, TargetReadings
 
 SETTINGS = TargetSettings(search_radius_m=0.5)
 AZIMUTH = 0.7

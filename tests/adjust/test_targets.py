@@ -22,11 +22,9 @@ from benchmarks.painted_targets import (
     read_picture,
 )
 from roadscan.adjust.kernels import target_shapes as kernels
+from roadscan.adjust.settings import TargetSettings
 from roadscan.adjust.targets.find import find_target
-from roadscan.adjust.targets.heights import height_at
-from roadscan.adjust.targets.settings import TargetSettings
-from roadscan.adjust.targets.shapes import Chequered, Disc
-from roadscan.adjust.targets.values import TargetReadings
+from roadscan.adjust.targets.shapes import Chequered, Disc, TargetReadings, height_at
 from roadscan.core.errors import ConfigError
 
 SETTINGS = TargetSettings()

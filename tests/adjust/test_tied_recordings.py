@@ -16,8 +16,7 @@ from roadscan.adjust.observations import KINDS, Observations
 from roadscan.adjust.patches import PassReadings
 from roadscan.adjust.places import Place, Track, places_of_overlap
 from roadscan.adjust.process import GaussMarkov, RunPrior
-from roadscan.adjust.solver_settings import AdjustmentSettings
-from roadscan.adjust.tie_settings import PlaceSettings, TieSettings
+from roadscan.adjust.settings import AdjustmentSettings, PlaceSettings, TieSettings
 from roadscan.adjust.ties.at_place import Ties, ties_at
 
 GPS_MINUS_UNIX_NS = (18 - 315_964_800) * 10**9

@@ -14,9 +14,9 @@ from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box, Scene
 from roadscan.simulate.caster import World, ray_key
 from roadscan.simulate.drive import Drive, drives_of
-from roadscan.simulate.earth import Earth
 from roadscan.simulate.lidar_model import lidar_model
 from roadscan.simulate.noise import stream
+from roadscan.simulate.path import Earth
 from roadscan.simulate.scene import Scene as SimulatedScene
 from roadscan.simulate.sensors import lidar
 from roadscan.simulate.surface import Surface

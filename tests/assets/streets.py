@@ -11,7 +11,7 @@ from roadscan.assets.returns import Returns
 from roadscan.simulate import Scene
 from roadscan.simulate.caster import World
 from roadscan.simulate.drive import drives_of
-from roadscan.simulate.earth import Earth
+from roadscan.simulate.path import Earth
 from roadscan.simulate.sensors.lidar import BODY_FROM_AXES, measure
 from roadscan.simulate.surface import Surface
 

@@ -26,12 +26,12 @@ from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, simulate, truth
-from roadscan.simulate.earth import Earth
+from roadscan.simulate.path import Earth
 from roadscan.site.layer import of_pictures as evidence_of_pictures
 from roadscan.site.material import Material as SiteMaterial
 from roadscan.site.parts.pictures import Pictures
 from roadscan.site.parts.vectors import site_layers
-from roadscan.store.inventory_schema import editable_columns
+from roadscan.store.asset_schema import editable_columns
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
 from tests.assets.known_assets import KnownLines, KnownSigns, true_lines, true_signs

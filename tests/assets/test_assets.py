@@ -28,7 +28,7 @@ from roadscan.assets.tasks.evidence import EVIDENCE
 from roadscan.assets.tasks.objects import OBJECTS
 from roadscan.assets.tasks.work import MADE, due_joins, plan_evidence
 from roadscan.core.errors import ConfigError, RunError
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.georeference.plan.plan import plan_of
 from roadscan.inventory.of_survey import truth_of
 from roadscan.report.blocks import Drawing, Picture, Table

@@ -14,8 +14,7 @@ from benchmarks.calibration_yard import mounting_error, profiler_yard
 from roadscan.calibrate.estimator import calibrate
 from roadscan.calibrate.kernels.surface_patches import MOMENTS, UNKNOWNS, Matches, match_patches
 from roadscan.calibrate.surfaces.heights import HeightTies, rows_of
-from roadscan.calibrate.surfaces.planes import PlaneTies
-from roadscan.calibrate.surfaces.readings import Pieces, Readings
+from roadscan.calibrate.surfaces.planes import Pieces, PlaneTies, Readings
 from roadscan.calibrate.unknowns import Prior, mounting_of
 from roadscan.core.errors import NavigationError
 from roadscan.core.settings.calibration import CalibrationSettings

@@ -20,9 +20,8 @@ from roadscan.calibrate.chessboard import Board, InteriorOptions, interior_from_
 from roadscan.calibrate.estimator import Prior
 from roadscan.calibrate.evidence import Traverse
 from roadscan.calibrate.resection import Exposure, Measured, Target, project, resect, tangents
-from roadscan.core.camera import Interior
 from roadscan.core.errors import ConfigError
-from roadscan.core.rig import Mounting, Rig, Sensor
+from roadscan.core.rig import Interior, Mounting, Rig, Sensor
 from roadscan.simulate import Scene, simulate, truth
 
 BOARD = Board(columns=9, rows=6, square_m=0.03)

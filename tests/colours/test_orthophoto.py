@@ -10,8 +10,7 @@ import pytest
 from benchmarks.judge_imagery import corner_shifts_m
 from benchmarks.painted_objects import photographed_street
 from roadscan.colours.ground import ground_of
-from roadscan.core.grid import Bounds
-from roadscan.core.ids import TileId
+from roadscan.core.grid import Bounds, TileId
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate import simulate, truth

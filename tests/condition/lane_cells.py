@@ -9,7 +9,7 @@ import numpy as np
 from roadscan.condition.kernels.sampling import CellTable
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.tasks.stretches import cell_table
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.simulate import Scene
 from roadscan.simulate.surface import Surface
 from roadscan.tiles.cells import TileCells

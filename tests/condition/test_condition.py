@@ -19,13 +19,12 @@ import shapely
 from benchmarks.bench_lanes import RoughSurvey, driven, rough_scene, run
 from roadscan.condition.index import ConditionIndex, Quantity, Value, condition_indices
 from roadscan.condition.indices.faulting import Faulting
-from roadscan.condition.indices.iri import Iri
+from roadscan.condition.indices.ride import Iri
 from roadscan.condition.lane_data import LaneData
 from roadscan.condition.settings import ConditionConfig
 from roadscan.condition.survey_lane import survey_lane
 from roadscan.condition.tasks import stretches
-from roadscan.condition.tasks.against_truth import compared_values, true_lane
-from roadscan.condition.tasks.compare import compare_surveys
+from roadscan.condition.tasks.compare import compare_surveys, compared_values, true_lane
 from roadscan.condition.tasks.stretches import cell_table
 from roadscan.condition.tasks.values import GroupTask, load_lane
 from roadscan.condition.tasks.work import MADE, plan_condition

@@ -8,10 +8,16 @@ import numpy as np
 import pytest
 from scipy.signal import StateSpace, lsim
 
-from roadscan.condition.profiles.iri import half_car_ride, iri_of, mean_roughness_index, rolling_iri
-from roadscan.condition.profiles.quarter_car import SPEED_M_PER_S
-from roadscan.condition.profiles.ride import ride
-from roadscan.condition.profiles.segments import Segments, segments_of
+from roadscan.condition.profiles.profiles import SPEED_M_PER_S
+from roadscan.condition.profiles.ride import (
+    Segments,
+    half_car_ride,
+    iri_of,
+    mean_roughness_index,
+    ride,
+    rolling_iri,
+    segments_of,
+)
 from roadscan.condition.profiles.tables import stretches_above
 from roadscan.core.errors import ProfileError
 

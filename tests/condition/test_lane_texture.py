@@ -12,9 +12,8 @@ import shapely
 from roadscan.compute.edges.painted_line import painted_line, without_lines
 from roadscan.condition.kernels.lane_texture import FIGURES, INTENSITY, SHARE, TEXTURE, texture_of_squares
 from roadscan.condition.kernels.sampling import MOST_CELLS, Cells, CellTable, gather, mean_intensities
-from roadscan.condition.on_lane.lines import lane_lines
+from roadscan.condition.lane_data import RavelledSection, TextureSquares, lane_lines, texture_squares
 from roadscan.condition.on_lane.ravelling import lane_levels, ravelled_section
-from roadscan.condition.on_lane.squares import RavelledSection, TextureSquares, texture_squares
 from roadscan.condition.profiles.tables import mean_profile_depth
 from roadscan.condition.profiles.texture import texture_segments
 from tests.condition.lane_cells import LaneOfCells

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 
 from roadscan.condition.index import Value
-from roadscan.condition.indices.rut_wire import RutWire
+from roadscan.condition.indices.ruts import RutWire
 from roadscan.condition.lane_data import CrossSections
-from roadscan.condition.of_sections.whole_sections import noisy
+from roadscan.condition.wheel_paths import noisy
 
 STATIONS = np.arange(0.0, 100.0, 0.5)
 OFFSETS = np.arange(-1.65, 1.7, 0.05)

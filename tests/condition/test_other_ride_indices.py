@@ -7,11 +7,9 @@ import pytest
 from scipy.signal import StateSpace, lsim, welch
 
 from roadscan.condition.kernels.steps import roll_beam, roll_wheel
-from roadscan.condition.profiles.ride_number import ride_number_of, ride_number_ride
-from roadscan.condition.profiles.segments import Segments, segments_of
-from roadscan.condition.profiles.spectrum import road_spectrum
-from roadscan.condition.profiles.straightedge import LENGTHS_M, straightedge_mm
+from roadscan.condition.profiles.ride import Segments, ride_number_of, ride_number_ride, segments_of
 from roadscan.condition.profiles.tables import stretches_above
+from roadscan.condition.profiles.unevenness import LENGTHS_M, road_spectrum, straightedge_mm
 from roadscan.core.errors import ProfileError
 
 

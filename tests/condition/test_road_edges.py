@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 import shapely
 
-from roadscan.condition.road_edges.find import KINDS
-from roadscan.condition.road_edges.on_lane import EdgeRows, edges_on_lane
-from roadscan.condition.road_edges.on_road import LEAD_M, RoadEdges, RoadStretch, road_edges, road_surfaces
-from roadscan.condition.road_edges.raster import TilePoints, tile_points
+from roadscan.condition.edge_raster import TilePoints, tile_points
+from roadscan.condition.lane_data import EdgeRows, edges_on_lane
+from roadscan.condition.road_edges import KINDS, LEAD_M, RoadEdges, RoadStretch, road_edges, road_surfaces
 from roadscan.condition.road_line import Lane, RoadLine
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.simulate import Scene
 from roadscan.simulate.surface import Surface
 from roadscan.tiles.cells import TileCells

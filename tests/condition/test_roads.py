@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from roadscan.condition import road_line
-from roadscan.condition.cracks_on_lane import located
+from roadscan.condition.lane_data import located
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.roads import Drive, StatedLine, find_roads
 from roadscan.condition.settings import ConditionConfig

@@ -9,11 +9,17 @@ import pytest
 import scipy.ndimage
 import shapely
 
-from roadscan.condition.roughness_regions.intensity import normalised_intensity, three_classes
-from roadscan.condition.roughness_regions.points import RoadPoints, pyramid, rotated_back
-from roadscan.condition.roughness_regions.raster import closed
-from roadscan.condition.roughness_regions.regions import SectionRegions, find_regions
-from roadscan.condition.roughness_regions.surface import fit, road_below
+from roadscan.condition.roughness_rasters import (
+    RoadPoints,
+    closed,
+    fit,
+    normalised_intensity,
+    pyramid,
+    road_below,
+    rotated_back,
+    three_classes,
+)
+from roadscan.condition.roughness_regions import SectionRegions, find_regions
 from roadscan.condition.settings import RoughnessRegionsConfig
 from roadscan.core.errors import ProfileError
 from tests.condition.road_section import ALL, ORIGIN, PATCH, SLANTED, SQUARE, TRENCH, Section

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.signal import detrend
 
-from roadscan.condition.profiles.segments import segments_of
+from roadscan.condition.profiles.ride import segments_of
 from roadscan.condition.profiles.tables import mean_profile_depth, mean_profile_depths, mpd, segment_depth_mm
 from roadscan.condition.profiles.texture import TextureSettings, rms_texture_mm, segment_rms_mm, texture_segments
 from roadscan.core.errors import ProfileError

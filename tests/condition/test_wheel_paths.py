@@ -8,11 +8,8 @@ import pytest
 from scipy.ndimage import correlate1d
 
 from roadscan.condition.lane_data import Profile
-from roadscan.condition.of_sections.wheel_paths import WheelPath, noise, without_noise
-from roadscan.condition.profiles.iri import iri_of
-from roadscan.condition.profiles.ride import ride
-from roadscan.condition.profiles.ride_number import ride_number_of, ride_number_ride
-from roadscan.condition.profiles.segments import Segments
+from roadscan.condition.profiles.ride import Segments, iri_of, ride, ride_number_of, ride_number_ride
+from roadscan.condition.wheel_paths import WheelPath, noise, without_noise
 
 Float64 = npt.NDArray[np.float64]
 

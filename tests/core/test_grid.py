@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from roadscan.assets.tasks.plan import cut_squares
-from roadscan.core.grid import Bounds, TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import Bounds, TileGrid, TileId
 from roadscan.tiles.blocks import Block, cut_blocks
 
 GRID = TileGrid(10.0, 0.05)

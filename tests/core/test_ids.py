@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from roadscan.core.errors import ConfigError
-from roadscan.core.ids import LanePass, PassId, RunId, TileId
+from roadscan.core.grid import LanePass, PassId, RunId, TileId
 
 
 @pytest.mark.parametrize("text", ["62342_484882", "-3_7", " 12,-4 "])

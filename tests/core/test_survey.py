@@ -14,7 +14,7 @@ from roadscan.core import rig as rig_module
 from roadscan.core import survey as survey_module
 from roadscan.core.errors import ConfigError, TimeSystemError
 from roadscan.core.gpstime import NS_PER_S, TimeSystem, gps_ns_from_utc
-from roadscan.core.ids import LanePass, PassId, RunId
+from roadscan.core.grid import LanePass, PassId, RunId
 from roadscan.core.strict import Strict, meanings
 from roadscan.core.survey import Survey, survey_file_model
 

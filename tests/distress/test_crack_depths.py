@@ -11,9 +11,8 @@ import pytest
 import shapely
 from numpy.lib.stride_tricks import sliding_window_view
 
-from roadscan.distress.crack_depths import NARROW_CELLS, WIDE_CELLS, blended
 from roadscan.distress.crack_network import join_cracks
-from roadscan.distress.cracks import crack_pieces
+from roadscan.distress.cracks import NARROW_CELLS, WIDE_CELLS, blended, crack_pieces
 from roadscan.distress.kernels.quantiles_along import quantiles_along
 from roadscan.distress.settings import CrackDetection, CrackJoining
 from roadscan.distress.valley_lines import LINE_HALF, flank_cells

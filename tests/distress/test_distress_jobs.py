@@ -10,8 +10,7 @@ import pytest
 
 from roadscan.core.crs import MapFrame
 from roadscan.core.errors import ConfigError, RoadscanError
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileGrid, TileId
 from roadscan.core.survey import Survey
 from roadscan.georeference.plan.plan import plan_survey
 from roadscan.run.code_reach import name_of, reached_code

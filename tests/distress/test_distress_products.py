@@ -12,15 +12,15 @@ import pytest
 
 from roadscan.core.crs import MapFrame
 from roadscan.core.errors import ConfigError, StoreError
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.distress.products.crack_pieces import CrackPieces
 from roadscan.distress.products.cracks import Cracks
 from roadscan.distress.products.pothole_pieces import PotholePieces
 from roadscan.distress.products.potholes import Potholes
 from roadscan.distress.settings import CrackDetection, CrackJoining, PotholeDetection, PotholeJoining
 from roadscan.store.schema import table_schema
-from roadscan.surface.tile import MEASURED, SurfaceTile
-from roadscan.surface.window import GridWindow
+from roadscan.surface.regions import MEASURED
+from roadscan.surface.tile import GridWindow, SurfaceTile
 from roadscan.tiles.lane_direction import LaneDirections
 from roadscan.tiles.product import product_named
 

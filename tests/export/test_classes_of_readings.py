@@ -20,7 +20,7 @@ from roadscan.cli import app
 from roadscan.core.errors import ConfigError
 from roadscan.core.survey import Survey
 from roadscan.export.classes import write_classes
-from roadscan.georeference.classes import LAS_CLASSES, READING_CLASSES
+from roadscan.georeference.road_profiles import LAS_CLASSES, READING_CLASSES
 from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
 from roadscan.run.stage import stages

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from roadscan.cli import app
-from roadscan.store.codecs.jpeg_segments import comment_of, with_comment, with_tags, without_tags
+from roadscan.store.codecs.image_files import comment_of, with_comment, with_tags, without_tags
 from tests.measuring.drive import DISTORTION, HEIGHT, MATRIX, WIDTH, Drive
 
 BAR_PX = 0.3

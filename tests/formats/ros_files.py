@@ -13,7 +13,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from roadscan.formats.ros.definitions import _SHIPPED
+from roadscan.formats.ros.bag import _SHIPPED
 
 KINDS: Final = ("ros1", "ros1-bz2", "ros1-lz4", "sqlite", "sqlite-message", "sqlite-file", "mcap", "mcap-storage")
 

@@ -11,7 +11,7 @@ import roadscan as rs
 from roadscan.cli import app
 from roadscan.core.crs import MapFrame
 from roadscan.core.rig import Sensor
-from roadscan.ingest.reading.later_headers import AGAIN
+from roadscan.ingest.reading.text_files import AGAIN
 from tests.formats.log_reading import GPS_SECONDS, read_log
 
 GPS_S = {"system": "gps", "unit": "s"}

@@ -12,8 +12,8 @@ from PIL import Image
 from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.core.rig import Sensor
 from roadscan.core.survey import ClockConfig
-from roadscan.formats.ros.unpack import unpack
-from roadscan.ingest.clocks import stated_pairs
+from roadscan.formats.ros.overview import unpack
+from roadscan.ingest import clock_pairs
 from tests.answers import roadscan
 from tests.formats.readings import read
 from tests.formats.ros_files import NS, header, write_bag
@@ -78,7 +78,7 @@ def test_pairs_put_a_count_from_power_on_on_gps_time(tmp_path: Path) -> None:
     unpack(bag, "/imu", tmp_path / "pairs")
     pairs = {"table": tmp_path / "pairs/pairs.csv", "system": "unix_utc", "arrivals": True, "sigma_s": 0.0005}
     config = ClockConfig.parse({"system": "free", "pairs": pairs})
-    fit = stated_pairs._fitted(config.model_dump_json(), tmp_path / "pairs/pairs.csv", "").fit
+    fit = clock_pairs._fitted(config.model_dump_json(), tmp_path / "pairs/pairs.csv", "").fit
     clock = Clock(TimeSystem.FREE, offset_s=fit.offset_s, drift_ppm=fit.drift * 1e6, reference_s=fit.reference_s)
     rows = read("ros_imu", bag, clock=clock, sensor=Sensor(kind="imu"))
     late = rows.epochs - (true_ns - 315_964_800 * NS + 18 * NS)

@@ -14,8 +14,7 @@ import shapely
 
 from roadscan.core.errors import ConfigError, CrsError
 from roadscan.core.survey import Survey
-from roadscan.georeference.centre_line import CentreLineBuffer
-from roadscan.georeference.plan.centre_line import CentreLines, load_buffer
+from roadscan.georeference.plan.centre_line import CentreLineBuffer, CentreLines, load_buffer
 from roadscan.georeference.plan.plan import plan_survey
 from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session

@@ -7,8 +7,8 @@ import pyarrow as pa
 from scipy.spatial.transform import Rotation
 
 from roadscan.core.scan_geometry import ScanGeometry
-from roadscan.georeference.classes import READING_CLASSES
 from roadscan.georeference.place import EVERYWHERE, Window
+from roadscan.georeference.road_profiles import READING_CLASSES
 from tests.georeference.test_place import metres, placement, returns, scene
 
 N = 4000

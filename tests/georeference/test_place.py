@@ -189,7 +189,7 @@ def test_intensity_of_eight_bits_fills_sixteen() -> None:
 
 
 def test_passes_are_half_open_spans() -> None:
-    from roadscan.core.ids import LanePass, PassId, RunId
+    from roadscan.core.grid import LanePass, PassId, RunId
 
     passes = [LanePass(PassId(7), RunId("r"), 10, 20), LanePass(PassId(9), RunId("r"), 20, 30)]
     assert passes_of(np.array([9, 10, 19, 20, 29, 30]), passes).tolist() == [0, 7, 7, 9, 9, 0]

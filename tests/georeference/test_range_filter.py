@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 
 from roadscan.core.settings.segmentation import RangeFilter
-from roadscan.georeference.range_filter import kept_in_turns, limits_of_turns
+from roadscan.georeference.road_profiles import kept_in_turns, limits_of_turns
 
 REACH_M, RADIUS_M = 8.0, 6.0
 

@@ -7,9 +7,8 @@ import pytest
 
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.core.settings.segmentation import SegmentationConfig
-from roadscan.georeference.classes import LAS_CLASSES, READING_CLASSES
 from roadscan.georeference.kernels.segmentation import height_threshold
-from roadscan.georeference.segmentation import segmented
+from roadscan.georeference.road_profiles import LAS_CLASSES, READING_CLASSES, segmented
 from tests.georeference.road_profiles import road_only
 
 CODES = {name: code for code, name in READING_CLASSES.items()}

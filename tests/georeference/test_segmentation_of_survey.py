@@ -14,8 +14,8 @@ import pytest
 from roadscan.core.errors import ConfigError
 from roadscan.core.survey import Survey
 from roadscan.export.classes import write_classes
-from roadscan.georeference.classes import LAS_CLASSES, NOT_ROAD, OVERLAPPING, READING_CLASSES
 from roadscan.georeference.plan.plan import plan_survey
+from roadscan.georeference.road_profiles import LAS_CLASSES, NOT_ROAD, OVERLAPPING, READING_CLASSES
 from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
 from roadscan.run.stage import stages

@@ -10,9 +10,7 @@ from roadscan.core.crs import LOCAL_WORLD
 from roadscan.core.rig import Mounting, Mountings
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.core.settings.segmentation import RangeFilter, RoadSegmentation
-from roadscan.georeference.classes import OVERLAPPING
-from roadscan.georeference.road_profiles import RoadFinder
-from roadscan.georeference.turns import WINDOW_NS, turn_limits
+from roadscan.georeference.road_profiles import OVERLAPPING, WINDOW_NS, RoadFinder, turn_limits
 from roadscan.poses.trajectory import Trajectory
 
 RADIUS_M, SPEED_M_PER_S, KNOT_NS = 6.0, 4.0, 5_000_000

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from roadscan.store.holding.lease import LEASE_S
+from roadscan.store.lease import LEASE_S
 from tests.hosts.conftest import Cluster, assert_same, contents
 
 pytestmark = [pytest.mark.nightly, pytest.mark.timeout(600)]

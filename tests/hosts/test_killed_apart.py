@@ -15,7 +15,7 @@ from typing import Final
 
 import pytest
 
-from roadscan.store.holding.lease import LEASE_S
+from roadscan.store.lease import LEASE_S
 from tests.hosts.conftest import Cluster, assert_same, contents
 from tests.hosts.host import Running
 from tests.hosts.test_hosts_apart import RUN_S

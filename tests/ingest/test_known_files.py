@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from roadscan.ingest.inspect.known_files import known_file, known_files
+from roadscan.ingest.inspect.file_kinds import known_file, known_files
 from roadscan.ingest.reading.format import log_formats
 from tests.answers import roadscan
 

@@ -13,9 +13,9 @@ import pytest
 
 from docs.mistakes import write_survey
 from roadscan.core.errors import FormatError
-from roadscan.ingest.reading import unpacked
+from roadscan.ingest.reading import text_files
+from roadscan.ingest.reading.text_files import open_unpacked
 from roadscan.ingest.reading.text_table import byte_pieces
-from roadscan.ingest.reading.unpacked import open_unpacked
 from tests.survey.test_mistakes import SOUND, run
 
 PACK: dict[str, Callable[[bytes], bytes]] = {"gzip": gzip.compress, "bzip2": bz2.compress, "xz": lzma.compress}
@@ -47,7 +47,7 @@ def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, part: bytes) ->
 @pytest.mark.parametrize("packing", PACK)
 def test_the_most_regular_log_is_no_bomb(tmp_path: Path, packing: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """100 poses a second of a vehicle that stands, without noise: nothing recorded packs better."""
-    monkeypatch.setattr(unpacked, "_FREE_BYTES", 1 << 20)
+    monkeypatch.setattr(text_files, "_FREE_BYTES", 1 << 20)
     line = b"%d.%02d,691000.000,5334000.000,102.000,0.000,0.000,45.000,0.010,0.010,0.020,0.001,0.001,0.002\n"
     rows = b"".join(line % (1461922218 + k // 100, k % 100) for k in range(100_000))
     log = tmp_path / "poses.csv"

@@ -14,7 +14,7 @@ import pytest
 
 from roadscan.core.survey import Survey
 from roadscan.ingest.ingest import survey_records
-from roadscan.ingest.same_content import same_content_findings
+from roadscan.ingest.sources import same_content_findings
 from roadscan.store.store import Store
 from tests.answers import answer_questions, first_survey, roadscan
 from tests.formats.ros_files import NS, header, write_bag

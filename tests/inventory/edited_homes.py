@@ -11,8 +11,7 @@ import shapely
 from roadscan.inventory.home import Content, Home, Mark, Sheet
 from roadscan.inventory.homes.geopackage import GeoPackage
 from roadscan.inventory.homes.postgis import PostGis
-from roadscan.store.asset_schema import asset_schema
-from roadscan.store.inventory_schema import asset_table
+from roadscan.store.asset_schema import asset_schema, asset_table
 from tests.inventory import qgis_edits as person
 
 KINDS = ("pole", "sign")

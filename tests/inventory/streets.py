@@ -12,11 +12,11 @@ import pyarrow as pa
 import shapely
 
 from roadscan.core.gpstime import gps_ns_from_utc
+from roadscan.inventory.found_distresses import Unknown, Visibility
 from roadscan.inventory.homes.geopackage import GeoPackage
 from roadscan.inventory.inventory import Inventory
 from roadscan.inventory.recording import Found, Rules
 from roadscan.inventory.settings import Matching
-from roadscan.inventory.visibility import Unknown, Visibility
 from roadscan.store.asset_schema import asset_schema
 from roadscan.store.asset_truth import AssetTruth
 from roadscan.store.digest import bytes_digest

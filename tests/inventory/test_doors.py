@@ -25,11 +25,9 @@ from roadscan.inventory.conflicts import pictures_of
 from roadscan.inventory.of_survey import FOUND
 from roadscan.inventory.state import state_at
 from roadscan.report.section import Material, sections
-from roadscan.store.asset_schema import asset_kind_names, asset_schema
+from roadscan.store.asset_schema import asset_columns, asset_kind_names, asset_schema
 from roadscan.store.asset_truth import AssetTruth
-from roadscan.store.digest import bytes_digest
-from roadscan.store.inventory_schema import asset_columns
-from roadscan.store.seal import sealed_parquet
+from roadscan.store.digest import bytes_digest, sealed_parquet
 from roadscan.store.store import Store
 from tests.inventory import qgis_edits as person
 from tests.inventory.streets import AUTUMN, EAST, NORTH, Everywhere, asset, found, inventory, poles

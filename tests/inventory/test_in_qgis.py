@@ -23,9 +23,8 @@ from PIL import Image
 from roadscan.inventory.home import CHOICES, FaultyEditsError, HomeError
 from roadscan.inventory.homes.postgis import PostGis
 from roadscan.inventory.inventory import Inventory
-from roadscan.inventory.qgis.project import Raster
-from roadscan.store.asset_schema import asset_kind_names, asset_schema
-from roadscan.store.inventory_schema import asset_columns, editable_columns
+from roadscan.inventory.qgis import Raster
+from roadscan.store.asset_schema import asset_columns, asset_kind_names, asset_schema, editable_columns
 from tests.inventory.postgres import server
 from tests.inventory.streets import AUTUMN, CRS, EAST, NORTH, Everywhere, asset, found, inventory, poles
 

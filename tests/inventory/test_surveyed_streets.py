@@ -18,7 +18,7 @@ import pytest
 
 import roadscan
 from roadscan.core.errors import DamagedError
-from roadscan.demo.demo_street import (
+from roadscan.demo.demo import (
     AUTUMN,
     SPRING,
     STAGES,

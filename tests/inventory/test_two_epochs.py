@@ -17,11 +17,11 @@ import shapely
 from roadscan.assets.visibility import PASSES
 from roadscan.core.errors import ConfigError, SchemaError
 from roadscan.core.gpstime import gps_ns_from_utc
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
+from roadscan.inventory.found_distresses import VisibilityGrid, VisibilityOfSquares
 from roadscan.inventory.home import FaultyEditsError
 from roadscan.inventory.identity import new_ids
 from roadscan.inventory.recording import Found
-from roadscan.inventory.visibility import VisibilityGrid, VisibilityOfSquares
 from tests.inventory import qgis_edits as person
 from tests.inventory.streets import AUTUMN, EAST, NORTH, SPRING, Everywhere, asset, found, inventory, poles
 

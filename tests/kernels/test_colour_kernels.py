@@ -5,7 +5,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from roadscan.colours.kernels.blending import blend
 from roadscan.colours.kernels.depths import grow, nearest_in_pixels, slopes
 from roadscan.colours.kernels.looks import (
     ALIKE,
@@ -21,6 +20,7 @@ from roadscan.colours.kernels.looks import (
     Camera,
     Depths,
     Limits,
+    blend,
     keep_best,
     leave_doubtful,
     leave_moved,

@@ -25,9 +25,9 @@ THROUGH_ITS_CALLER = {
     "georeference.kernels.flat_profiles.profile_forms": "tests/georeference/test_place.py",
     "georeference.kernels.reach.reach_of_profiles": "tests/georeference/test_reach.py",
     "georeference.kernels.reach.reach_of_returns": "tests/georeference/test_reach.py",
-    "georeference.kernels.timed_points.georeference_mirror": "tests/georeference/test_place.py",
-    "georeference.kernels.timed_points.georeference_returns": "tests/georeference/test_place.py",
-    "georeference.kernels.timed_points.places": "tests/georeference/test_place.py",
+    "georeference.kernels.timed_readings.georeference_mirror": "tests/georeference/test_place.py",
+    "georeference.kernels.timed_readings.georeference_returns": "tests/georeference/test_place.py",
+    "georeference.kernels.timed_readings.places": "tests/georeference/test_place.py",
     "navigation.inertial.kernels.kalman.filter_forwards": "tests/navigation/test_inertial_smoother.py",
     "navigation.inertial.kernels.kalman_smoother.spread": "tests/navigation/test_inertial_smoother.py",
     "navigation.inertial.kernels.kalman.advance": "tests/navigation/test_inertial_smoother.py",
@@ -46,7 +46,7 @@ THROUGH_ITS_CALLER = {
     "surface.kernels.spline_gradients.load": "tests/surface/test_detailed.py",
     "surface.kernels.spline_gradients.spline_gradients": "tests/surface/test_detailed.py",
     "surface.kernels.spline_gradients.vertex_gradients": "tests/surface/test_detailed.py",
-    "surface.kernels.vertex_neighbourhoods.neighbourhoods": "tests/surface/test_detailed.py",
+    "surface.kernels.delaunay.neighbourhoods": "tests/surface/test_detailed.py",
 }
 """Kernels whose input takes a room to make, and the test that holds what comes out against truth from outside."""
 

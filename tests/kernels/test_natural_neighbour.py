@@ -18,7 +18,7 @@ from roadscan.condition.kernels.natural_neighbour import (
     triangulate,
     walk,
 )
-from roadscan.condition.natural_neighbour import insertion_order, interpolate
+from roadscan.condition.roughness_rasters import insertion_order, interpolate
 
 
 def scattered(n: int, seed: int = 0) -> np.ndarray:

@@ -8,8 +8,17 @@ import lzf
 import numpy as np
 
 from roadscan.formats.clouds.kernels.lzf import expand
-from roadscan.formats.lidars.kernels.ouster import Layout, Optics, Returns, checksum_tables, checksums, decode
-from roadscan.formats.lidars.kernels.velodyne import Firings, Room, returned
+from roadscan.formats.lidars.kernels.packets import (
+    Firings,
+    Layout,
+    Optics,
+    Returns,
+    Room,
+    checksum_tables,
+    checksums,
+    decode,
+    returned,
+)
 from roadscan.store.codecs.kernels.byte_planes import LONGEST_RUN_BYTES, decode_runs, encode_runs
 from roadscan.store.readings.kernels.firings import SLOTS, BeamTable, Packed, Turned, positions
 

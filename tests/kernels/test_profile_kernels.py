@@ -10,7 +10,7 @@ from scipy.signal import cont2discrete
 
 from roadscan.condition.kernels.quarter_car import roll
 from roadscan.condition.kernels.steps import roll_beam, roll_wheel
-from roadscan.condition.profiles.quarter_car import GOLDEN_CAR, RULES, SPEED_M_PER_S
+from roadscan.condition.profiles.profiles import GOLDEN_CAR, RULES, SPEED_M_PER_S
 
 K1, K2, C, MU = 653.0, 63.3, 6.0, 0.15
 MOTION = np.array([[0, 1, 0, 0], [-K2, -C, K2, C], [0, 0, 0, 1], [K2 / MU, C / MU, -(K1 + K2) / MU, -C / MU]])

@@ -11,7 +11,7 @@ from roadscan.condition.kernels.ruts import straightedge, stretched_wire, water,
 from roadscan.condition.kernels.sampling import CellTable, factorise, sample
 from roadscan.condition.kernels.steps import step_heights
 from roadscan.condition.tasks.stretches import cell_table
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.tiles.cells import TileCells
 
 CELL_M = 0.05

@@ -14,18 +14,16 @@ from roadscan.calibrate.kernels.ties import SIDE, tie_residuals, tie_rows
 from roadscan.compute.kernels.curved_grid import accumulate_curved, thin_path
 from roadscan.compute.kernels.profile_bounds import range_bounds
 from roadscan.distress.kernels.crack_response import add_bend, deepen, fill_holes, line_sums, thin
-from roadscan.georeference.kernels.block_ranges import block_ranges
 from roadscan.georeference.kernels.carriageway import keep_road
-from roadscan.georeference.kernels.tile_set import add_tile, empty, mark_zonotope, take, tile_set
-from roadscan.georeference.kernels.timed_points import between_ticks
+from roadscan.georeference.kernels.tile_set import add_tile, block_ranges, empty, mark_zonotope, take, tile_set
+from roadscan.georeference.kernels.timed_readings import between_ticks
 from roadscan.navigation.inertial.kernels.strapdown import geodetic_of, gravity_at, turned_frame
-from roadscan.pictures.kernels.picture_colours import sample, take_better
+from roadscan.pictures.kernels.lens import sample, take_better
 from roadscan.surface.kernels.coarse import CellSums, Profiles, rasterise, spline_profiles, sum_patches
-from roadscan.surface.kernels.delaunay import flip_edges
+from roadscan.surface.kernels.delaunay import flip_edges, grow, is_narrow, units, whitening
 from roadscan.surface.kernels.ground import depths, grounds, highest, rim, slopes
 from roadscan.surface.kernels.line_medians import keep_better, window_sums
 from roadscan.surface.kernels.smoothing import choose_filters, descend
-from roadscan.surface.kernels.vertex_neighbourhoods import grow, is_narrow, units, whitening
 
 
 def test_spans_of_ranges() -> None:

@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from roadscan.adjust.kernels.correlation import Laid, correlate, lay_upon
 from roadscan.adjust.kernels.patch_cells import (
     Cells,
     Frame,
+    Laid,
     Splat,
     add_moments,
     cell_numbers,
+    correlate,
     fill_cells,
+    lay_upon,
     leave_out_far,
     local_axes,
     splat,

@@ -189,7 +189,7 @@ def _prepare() -> None:
     from roadscan.ingest.reading.format import log_formats
     from roadscan.report.section import sections
     from roadscan.run.stage import stages
-    from roadscan.site.part import site_parts
+    from roadscan.site.document import site_parts
     from roadscan.tiles.product import products
 
     assert stages() and log_formats() and products() and sections() and site_parts()

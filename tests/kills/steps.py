@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from roadscan.core.survey import Survey
-from roadscan.demo.demo_street import write_height
+from roadscan.demo.demo import write_height
 from roadscan.inventory.of_survey import open_inventory
 from roadscan.run.session import Session
 from roadscan.run.stage import stages

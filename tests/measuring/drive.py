@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from roadscan.simulate import simulate, truth
-from roadscan.simulate.earth import Earth
+from roadscan.simulate.path import Earth
 from tests.surveys import Simulated, small_scene
 
 FOCAL, WIDTH, HEIGHT = 520.0, 640, 400

@@ -13,14 +13,13 @@ from typer.testing import CliRunner
 
 import roadscan as rs
 from roadscan.cli import app
-from roadscan.core.camera import Interior
 from roadscan.core.errors import ConfigError
+from roadscan.core.rig import Interior
 from roadscan.core.survey import Survey
 from roadscan.georeference.sources import MOUNTING_COLUMNS
 from roadscan.measuring.kernels.march import BELOW, NO_GROUND, first_hits
 from roadscan.measuring.measure import length_of, measure, meet
-from roadscan.pictures.camera_changes import COLUMNS
-from roadscan.pictures.lens import pixels_of, rays_of
+from roadscan.pictures.lens import COLUMNS, pixels_of, rays_of
 from roadscan.pictures.views import Lens
 from roadscan.run.session import Session
 from roadscan.site.where import pictures_of_place

@@ -11,17 +11,16 @@ import pyarrow.csv as pa_csv
 from scipy.spatial.transform import Rotation
 
 from roadscan.core.gpstime import TimeSystem
-from roadscan.ingest.clocks.correction import ClockCorrection
+from roadscan.ingest.clock_correction import ClockCorrection
 from roadscan.navigation.inertial.readings import ImuReadings, OdometerReadings
 from roadscan.poses.trajectory import Trajectory
 from roadscan.simulate import Scene
 from roadscan.simulate.drive import Drive, drives_of
-from roadscan.simulate.earth import Earth
 from roadscan.simulate.noise import GaussMarkov, stream
+from roadscan.simulate.path import Earth
 from roadscan.simulate.scene import ClockError
-from roadscan.simulate.sensors.clock import SensorClock
-from roadscan.simulate.sensors.encoder import write_encoder
-from roadscan.simulate.sensors.imu import head_imus, write_imu
+from roadscan.simulate.sensors.clock import SensorClock, write_encoder
+from roadscan.simulate.sensors.gnss import head_imus, write_imu
 from roadscan.simulate.surface import Surface
 
 WORLD = "EPSG:4978"

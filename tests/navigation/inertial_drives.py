@@ -16,9 +16,9 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from roadscan.core.frames import rotation_from_quaternion
-from roadscan.core.imu import IMU_GRADES, ImuErrors, ImuGrade
-from roadscan.core.settings.smoothing import SmootherConfig
-from roadscan.navigation.inertial.earth import ecef_from_level
+from roadscan.core.rig import IMU_GRADES, ImuErrors, ImuGrade
+from roadscan.core.settings.navigation import SmootherConfig
+from roadscan.navigation.inertial.alignment import ecef_from_level
 from roadscan.navigation.inertial.readings import (
     GnssSolutions,
     ImuReadings,
@@ -28,11 +28,11 @@ from roadscan.navigation.inertial.readings import (
 )
 from roadscan.simulate import Scene
 from roadscan.simulate.drive import Drive, Poses, drives_of
-from roadscan.simulate.earth import Earth
 from roadscan.simulate.noise import stream
+from roadscan.simulate.path import Earth
 from roadscan.simulate.sensors import gnss as simulated_gnss
-from roadscan.simulate.sensors import imu as simulated_imu
-from roadscan.simulate.sensors.encoder import WheelEncoder
+from roadscan.simulate.sensors import gnss as simulated_imu
+from roadscan.simulate.sensors.clock import WheelEncoder
 from roadscan.simulate.surface import Surface
 
 Gaps = tuple[tuple[float, float], ...]

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.core.crs import world_from_geodetic
 from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S
-from roadscan.core.imu import ImuErrors
+from roadscan.core.rig import ImuErrors
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings, VehicleSensors
 
 WORLD = "EPSG:4978"

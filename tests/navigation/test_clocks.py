@@ -21,7 +21,7 @@ from roadscan.core.clock_evidence import MotionEvidence
 from roadscan.core.errors import ConfigError, FormatError, RoadscanError, RunError
 from roadscan.core.gpstime import gps_ns_from_utc
 from roadscan.core.survey import LogConfig, Survey
-from roadscan.ingest.clocks.stated_pairs import log_pairs
+from roadscan.ingest.clock_pairs import log_pairs
 from roadscan.ingest.ingest import ingest, survey_records
 from roadscan.navigation.tasks.clocks import estimate_clocks, load_clocks
 from roadscan.run.session import Session

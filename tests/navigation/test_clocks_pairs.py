@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 
-from roadscan.ingest.clocks.correction import ClockCorrection, Residuals
-from roadscan.ingest.clocks.lines import robust_line
-from roadscan.ingest.clocks.pairs import PairFit, Pairs, clock_from_arrivals, clock_from_pairs, lower_hull
+from roadscan.ingest.clock_correction import ClockCorrection, Residuals, robust_line
+from roadscan.ingest.clock_pairs import PairFit, Pairs, clock_from_arrivals, clock_from_pairs, lower_hull
 
 S = 10**9
 T0 = 1_400_000_000 * S

@@ -15,20 +15,19 @@ from scipy.spatial.transform import Rotation
 from roadscan.core.crs import geodetic_from_world, world_from_geodetic
 from roadscan.core.errors import ConfigError, CrsError, NavigationError, RoadscanError, TimeSystemError
 from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, WEEK_S
-from roadscan.core.imu import IMU_GRADES
-from roadscan.core.settings.smoothing import SmootherConfig
+from roadscan.core.rig import IMU_GRADES
+from roadscan.core.settings.navigation import SmootherConfig
 from roadscan.navigation.inertial.checks import Prepared, prepared
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings, VehicleSensors
 from roadscan.navigation.inertial.smoother import solve
 from roadscan.navigation.tasks.solve_trajectory import check_outcome
 from roadscan.simulate import Scene
 from roadscan.simulate.drive import drives_of
-from roadscan.simulate.earth import Earth
 from roadscan.simulate.noise import stream
-from roadscan.simulate.sensors.encoder import WheelEncoder
-from roadscan.simulate.sensors.gnss import FIXED
+from roadscan.simulate.path import Earth
+from roadscan.simulate.sensors.clock import WheelEncoder
+from roadscan.simulate.sensors.gnss import FIXED, _SensorErrors, felt, first_gps_ns, imu_of
 from roadscan.simulate.sensors.gnss import solve as solutions_of
-from roadscan.simulate.sensors.imu import _SensorErrors, felt, first_gps_ns, imu_of
 from roadscan.simulate.surface import Surface
 from tests.navigation.recorded_drive import recorded_drive
 

@@ -12,7 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from roadscan.core.frames import ecef_from_ned, quaternion_from_rotation, rotation_from_rph
-from roadscan.navigation.inertial.earth import ecef_from_level, gravity_ecef
+from roadscan.navigation.inertial.alignment import ecef_from_level, gravity_ecef
 from roadscan.navigation.inertial.kernels.strapdown import increments, strapdown
 from tests.navigation.inertial_drives import NO_GAPS, simulated, urban
 

@@ -11,8 +11,8 @@ from scipy.stats import chi2
 
 from roadscan.core.errors import NavigationError
 from roadscan.core.frames import rotation_from_quaternion
-from roadscan.core.imu import IMU_GRADES, ImuGrade
-from roadscan.core.settings.smoothing import SmootherConfig
+from roadscan.core.rig import IMU_GRADES, ImuGrade
+from roadscan.core.settings.navigation import SmootherConfig
 from roadscan.navigation.inertial import smoother
 from roadscan.navigation.inertial.kernels.kalman_smoother import smooth_backwards
 from roadscan.navigation.inertial.kernels.kalman_states import NAVIGATION, WITHOUT_SCALES

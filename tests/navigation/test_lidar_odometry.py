@@ -17,10 +17,9 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from roadscan.core import extras
-from roadscan.core.settings.odometry import OdometryConfig
+from roadscan.core.settings.navigation import OdometryConfig
 from roadscan.core.survey import Survey
-from roadscan.navigation.odometry.registration import Matched, Sweep, match
-from roadscan.navigation.odometry.rig_motion import Way, Windows, sigmas
+from roadscan.navigation.odometry import Matched, Sweep, Way, Windows, match, sigmas
 from roadscan.navigation.tasks.odometry_trajectory import findings
 from roadscan.simulate import Scene, simulate
 from roadscan.store.logs import read_log_records

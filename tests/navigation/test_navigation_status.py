@@ -19,8 +19,7 @@ from roadscan.report.section import Material
 from roadscan.report.sections.navigation import Navigation
 from roadscan.run.session import Session
 from roadscan.simulate import simulate
-from roadscan.simulate.sensors.gnss import Solutions, write_pos
-from roadscan.simulate.sensors.imu import COLUMNS
+from roadscan.simulate.sensors.gnss import COLUMNS, Solutions, write_pos
 from roadscan.store.logs import read_log_records
 from roadscan.store.query.sql import query
 from roadscan.store.store import Store

@@ -14,13 +14,13 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.core.errors import NavigationError
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.core.settings.smoothing import SmootherConfig, SplineConfig
+from roadscan.core.settings.navigation import SmootherConfig, SplineConfig
 from roadscan.navigation.inertial.smoother import solve
 from roadscan.navigation.spline import Smoothed, smoothed
 from roadscan.poses.trajectory import Trajectory
 from roadscan.simulate import Scene
 from roadscan.simulate.drive import drives_of
-from roadscan.simulate.earth import Earth
+from roadscan.simulate.path import Earth
 from roadscan.simulate.surface import Surface
 from tests.navigation.recorded_drive import recorded_drive
 

@@ -2,7 +2,7 @@
 
 The gait follows published figures of level walking: two steps a second, a vertical path of ± 2 to 4 cm at step rate,
 a sideways one of ± 2 cm at half of it (Inman, Ralston and Todd 1981, "Human walking"), heel strikes of some g that
-ring at tens of hertz. The errors of the IMU go beyond what :class:`~roadscan.core.imu.ImuErrors` describes: its bias
+ring at tens of hertz. The errors of the IMU go beyond what :class:`~roadscan.core.rig.ImuErrors` describes: its bias
 wanders within a minute, vibration shifts it, and gyroscopes feel accelerations.
 """
 
@@ -15,14 +15,14 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from roadscan.core.imu import IMU_GRADES
-from roadscan.core.settings.smoothing import SmootherConfig
-from roadscan.navigation.inertial.earth import ecef_from_level
+from roadscan.core.rig import IMU_GRADES
+from roadscan.core.settings.navigation import SmootherConfig
+from roadscan.navigation.inertial.alignment import ecef_from_level
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, Solution, VehicleSensors
 from roadscan.simulate.drive import Poses
-from roadscan.simulate.earth import Earth
 from roadscan.simulate.noise import GaussMarkov
-from roadscan.simulate.sensors.imu import AT_BODY, felt
+from roadscan.simulate.path import Earth
+from roadscan.simulate.sensors.gnss import AT_BODY, felt
 from tests.navigation.inertial_drives import rows
 
 START_GPS_NS = 1_400_000_000 * 10**9

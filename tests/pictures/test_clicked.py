@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from roadscan.core.errors import ConfigError
-from roadscan.pictures.clicked import ClickedPoints
+from roadscan.pictures.points import ClickedPoints
 
 
 def click(file: Path, picture: int) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.pictures.camera_changes import JOINT, JointCovariances
+from roadscan.pictures.lens import JOINT, JointCovariances
 
 NS = 1_000_000_000
 SIZE = np.array([0.02, 0.02, 0.03, 1e-3, 1e-3, 2e-3])

@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from roadscan.core.camera import Interior
-from roadscan.pictures.camera_changes import changed
-from roadscan.pictures.lens import derivatives, pixels_of, rays_of
+from roadscan.core.rig import Interior
+from roadscan.pictures.lens import changed, derivatives, pixels_of, rays_of
 from roadscan.pictures.views import Lens
 
 LENS = Interior(

@@ -20,7 +20,7 @@ from roadscan.ingest.ingest import ingest
 from roadscan.pictures.placed import plan_pictures
 from roadscan.pictures.points import control_rows, measured_points
 from roadscan.pictures.settings import PictureTargetsConfig
-from roadscan.pictures.targets.aim import TargetPoint
+from roadscan.pictures.targets.candidates import TargetPoint
 from roadscan.pictures.targets.find import find_targets, seek
 from roadscan.pictures.views import PictureRule
 from roadscan.simulate import simulate

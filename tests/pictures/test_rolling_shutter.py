@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from roadscan.adjust.tasks.outcome import ADJUSTMENT, SOLUTION
 from roadscan.core.survey import Survey
 from roadscan.georeference.plan.plan import plan_without_readings
-from roadscan.pictures.kernels.picture_colours import take_better
+from roadscan.pictures.kernels.lens import take_better
 from roadscan.pictures.lens import eye_shifts_m, pixels_of, rays_of
 from roadscan.pictures.placed import Pictures, plan_pictures
 from roadscan.pictures.views import PictureRule

@@ -11,9 +11,8 @@ import numpy.typing as npt
 import pytest
 
 from roadscan.pictures.lens import pixels_of
-from roadscan.pictures.ties.features import Features, features_of
+from roadscan.pictures.ties.matching import Features, features_of, is_at, sky_of
 from roadscan.pictures.ties.own_vehicle import CELLS, Compared, compare, compared_pictures
-from roadscan.pictures.ties.sky import is_at, sky_of
 from tests.adjust.test_bundle import LENS, Block, simulated_drive
 
 Float64 = npt.NDArray[np.float64]

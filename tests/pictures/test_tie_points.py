@@ -7,8 +7,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from roadscan.pictures.ties.features import features_of
-from roadscan.pictures.ties.matching import Relative, matches
+from roadscan.pictures.ties.matching import Relative, features_of, matches
 from roadscan.pictures.ties.tracks import places_of, spread, tracks_of, widest_parallax_rad
 
 Float64 = npt.NDArray[np.float64]

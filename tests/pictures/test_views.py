@@ -8,8 +8,8 @@ import pytest
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
-from roadscan.core.camera import Interior
 from roadscan.core.errors import ConfigError
+from roadscan.core.rig import Interior
 from roadscan.pictures.views import NO_VIEW, Lens, PictureRule, Views, best_views, sampled
 
 LENSES = (

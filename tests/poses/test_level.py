@@ -7,9 +7,9 @@ import pytest
 from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
-from roadscan.adjust.swath import swath_of
+from roadscan.adjust.tasks.tracks import swath_of
 from roadscan.core.crs import MapFrame, grid_convergence_rad
-from roadscan.poses.level import LevelPoses, level_poses
+from roadscan.poses.movement import LevelPoses, level_poses
 from roadscan.poses.trajectory import Trajectory
 
 LON, LAT = 11.4, 48.2

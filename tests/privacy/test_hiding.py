@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from roadscan.core.errors import ConfigError
-from roadscan.privacy.detector import Detector
-from roadscan.privacy.hiding import Region, hidden
+from roadscan.privacy.detector import Detector, Region, hidden
 from roadscan.privacy.settings import DetectorConfig
 from tests.privacy.networks import red_detector
 

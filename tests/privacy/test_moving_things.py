@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from roadscan.measuring.measure import posed_pictures
-from roadscan.privacy.hider import Hider
-from roadscan.privacy.returns import ClassedReturns
+from roadscan.privacy.hider import ClassedReturns, Hider
 from roadscan.privacy.settings import PrivacyConfig
 from roadscan.run.session import Session
 from roadscan.simulate import Scene, simulate

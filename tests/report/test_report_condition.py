@@ -19,9 +19,8 @@ from roadscan.report.page import report_page
 from roadscan.report.sections.adjustment import agreement
 from roadscan.run.session import Session
 from roadscan.simulate import Scene, simulate
-from roadscan.store.digest import bytes_digest
+from roadscan.store.digest import bytes_digest, sealed_parquet
 from roadscan.store.manifest import Manifest
-from roadscan.store.seal import sealed_parquet
 from tests.answers import roadscan
 
 NOT_MEASURED = "mpd_mean_mm: no section has a value; cells have 50 mm; a mean profile depth takes 10 mm or less."

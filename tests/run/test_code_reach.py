@@ -178,20 +178,20 @@ def test_the_tiles_reach_what_shapes_them_and_no_settings_of_other_stages() -> N
         "roadscan.poses.trajectory:Corrections",
         "roadscan.georeference.charts:Charts",
     } <= reached.keys()
-    assert {"roadscan.ingest.clocks.correction", "roadscan.tiles.cells", "roadscan.core.crs"} <= modules
+    assert {"roadscan.ingest.clock_correction", "roadscan.tiles.cells", "roadscan.core.crs"} <= modules
     rooms = ("inspect", "simulate", "surfaces", "condition", "assets", "adjust", "cli", "products.hillshade")
     assert not [m for m in modules if m.startswith(tuple(f"roadscan.{room}" for room in rooms))]
     assert not [
         p
         for p in reached
-        if p.startswith(("roadscan.core.settings.smoothing:Smoother", "roadscan.core.settings.calibration:C"))
+        if p.startswith(("roadscan.core.settings.navigation:Smoother", "roadscan.core.settings.calibration:C"))
     ]
 
 
 def test_the_adjustment_reaches_no_code_that_planned_its_sources() -> None:
     """Logs and trajectories count by the keys of the sources that come of them."""
     modules = {p.partition(":")[0] for p in reached_code(["roadscan.adjust.tasks.adjustment:adjust_survey"])}
-    assert {"roadscan.adjust.estimation", "roadscan.adjust.control.control", "roadscan.georeference.place"} <= modules
+    assert {"roadscan.adjust.estimation", "roadscan.adjust.control", "roadscan.georeference.place"} <= modules
     rooms = ("ingest.planned_logs", "ingest.inspect", "navigation.inertial", "navigation.odometry", "simulate")
     assert not [m for m in modules if m.startswith(tuple(f"roadscan.{room}" for room in rooms))]
 

@@ -12,13 +12,13 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
 from roadscan.core.errors import RunError, StoreError, may_pass
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Inline
 from roadscan.run.selection import Selection
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
-from roadscan.store.holding.look import look_of
+from roadscan.store.holders import look_of
 from roadscan.store.manifest import Manifest
 from roadscan.store.query.sql import query
 from roadscan.store.store import Store

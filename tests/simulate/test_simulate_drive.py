@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from roadscan.core.errors import ConfigError
 from roadscan.simulate.drive import RUN_UP_S, Drive, drives_of
-from roadscan.simulate.earth import Earth
+from roadscan.simulate.path import Earth
 from roadscan.simulate.scene import Mount, Scene
 from roadscan.simulate.surface import Surface
 

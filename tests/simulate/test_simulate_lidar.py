@@ -17,8 +17,8 @@ from roadscan.core.gpstime import gps_ns_from_utc, utc_from_gps_ns
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.caster import World
 from roadscan.simulate.drive import Drive
-from roadscan.simulate.earth import Earth
 from roadscan.simulate.lidar_model import lidar_model
+from roadscan.simulate.path import Earth
 from roadscan.simulate.run import SimulatedSurvey
 from roadscan.simulate.sensors.lidar import measure
 from roadscan.simulate.surface import Surface

@@ -17,8 +17,8 @@ from roadscan.core.gpstime import gps_ns_from_utc
 from roadscan.core.survey import Survey
 from roadscan.simulate import Scene, SimulatedSurvey, simulate, truth
 from roadscan.simulate.drive import Drive
-from roadscan.simulate.earth import Earth
 from roadscan.simulate.files import write_control
+from roadscan.simulate.path import Earth
 from roadscan.simulate.surface import Surface
 from tests.simulate.chain import WEEK_NS, Chain, read_sbet
 

@@ -12,7 +12,7 @@ import pytest
 from roadscan.core.errors import ConfigError, FormatError
 from roadscan.simulate import Scene, simulate, trajectory, truth
 from roadscan.simulate.drive import Drive
-from roadscan.simulate.earth import Earth
+from roadscan.simulate.path import Earth
 from roadscan.simulate.sensors import profiler
 from roadscan.simulate.surface import Surface
 

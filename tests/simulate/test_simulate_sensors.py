@@ -22,11 +22,10 @@ from roadscan.core.survey import Survey
 from roadscan.ingest.ingest import ingest
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.drive import Drive, drives_of
-from roadscan.simulate.earth import Earth
+from roadscan.simulate.path import Earth
 from roadscan.simulate.scene import ClockError
 from roadscan.simulate.sensors.clock import SensorClock
-from roadscan.simulate.sensors.gnss import FIXED, FLOAT, solve
-from roadscan.simulate.sensors.imu import AT_BODY, felt, imu_of
+from roadscan.simulate.sensors.gnss import AT_BODY, FIXED, FLOAT, felt, imu_of, solve
 from roadscan.simulate.surface import Surface
 from roadscan.store.logs import read_log_records
 from roadscan.store.store import Store
@@ -93,7 +92,7 @@ def test_imu_at_rest_feels_gravity_and_the_earths_rotation():
 
 def test_imu_grades_have_their_errors():
     scene = Scene.load("demo").changed(length_m=60.0, **BARE)
-    from roadscan.simulate.sensors.imu import _SensorErrors
+    from roadscan.simulate.sensors.gnss import _SensorErrors
 
     for grade, noise in (("tactical", 50.0), ("mems", 150.0)):
         one = imu_of(scene.changed(imu={"on": True, "grade": grade}))

@@ -12,8 +12,8 @@ import pytest
 
 from roadscan.simulate.caster import SLOT_NS, Hits, Pattern, World
 from roadscan.simulate.drive import Drive
-from roadscan.simulate.earth import Earth
 from roadscan.simulate.lidar_model import lidar_model
+from roadscan.simulate.path import Earth
 from roadscan.simulate.scene import Mount, Scene
 from roadscan.simulate.sensors.lidar import BODY_FROM_AXES, measure
 from roadscan.simulate.surface import Surface

@@ -44,9 +44,9 @@ from roadscan.site.live import LiveSite, open_survey
 from roadscan.site.material import Material, Wishes, box_from_text, box_of_road
 from roadscan.site.parts import strips, vectors
 from roadscan.site.parts.edits import Edits
-from roadscan.site.parts.features import Features
 from roadscan.site.parts.rasters import images_of
 from roadscan.site.parts.strips import Strips
+from roadscan.site.parts.vectors import Features
 from roadscan.site.report_copy import REPORT
 from roadscan.site.single import write_single
 from roadscan.site.site import KEYS, Published, entry, publish

@@ -6,8 +6,7 @@ import random
 
 import pytest
 
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileGrid, TileId
 from roadscan.site.site_rasters import Place, Pyramid
 
 TILES = sorted({TileId(69_000 + k, 533_400 + k // 3 + s) for k in range(-40, 40) for s in (0, 1)})

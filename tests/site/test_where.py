@@ -15,7 +15,7 @@ import roadscan as rs
 from roadscan.cli import app
 from roadscan.core.errors import ConfigError
 from roadscan.simulate import simulate, truth
-from roadscan.simulate.earth import Earth
+from roadscan.simulate.path import Earth
 from tests.surveys import Simulated, small_scene
 
 LENS = {"on": True, "every_m": 3.0, "width_px": 320, "height_px": 240, "focal_px": 260.0,

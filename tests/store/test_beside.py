@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from roadscan.store.holding import beside as module
-from roadscan.store.holding.beside import beside, put_folder
+from roadscan.store import holders
+from roadscan.store.holders import beside, put_folder
 
 
 def made(place: Path, content: str) -> Path:
@@ -25,7 +25,7 @@ def test_a_folder_takes_the_place_of_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, can_exchange: bool
 ) -> None:
     if not can_exchange:
-        monkeypatch.setattr(module, "_exchanged", lambda _one, _other: False)
+        monkeypatch.setattr(holders, "_exchanged", lambda _one, _other: False)
     for content in ("first", "second", "third"):
         put_folder(made(tmp_path / "site", content), tmp_path / "site")
         assert (tmp_path / "site/file").read_text() == content

@@ -15,9 +15,9 @@ from pathlib import Path
 import pytest
 
 from roadscan.core.errors import StoreError
-from roadscan.store.holding import lease
-from roadscan.store.holding.lease import LEASE_S, ObjectPlace
-from roadscan.store.holding.process import Process, own_tag, tag_lives
+from roadscan.store import lease
+from roadscan.store.holders import Process, own_tag, tag_lives
+from roadscan.store.lease import LEASE_S, ObjectPlace
 from roadscan.store.store import Store
 from tests.conftest import REPOSITORY
 from tests.object_store import ObjectStore, served

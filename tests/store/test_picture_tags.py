@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
-from roadscan.store.codecs.picture_tags import picture_tags, tags_in_words
+from roadscan.store.codecs.image_files import picture_tags, tags_in_words
 from tests.answers import roadscan
 
 

@@ -9,11 +9,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from roadscan.store import row_order
+from roadscan.store import writer as row_order
 from roadscan.store.digest import bytes_digest
-from roadscan.store.row_order import in_order, ordered, sorted_batch, sorted_rows
 from roadscan.store.schema import table_schema
-from roadscan.store.writer import LogWriter
+from roadscan.store.writer import LogWriter, in_order, ordered, sorted_batch, sorted_rows
 from tests.store.readings.test_returns import SCHEMA
 
 START = 1_400_000_000 * 10**9

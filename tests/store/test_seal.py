@@ -9,8 +9,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from roadscan.core.errors import DamagedError
+from roadscan.store.digest import check_seal, sealed_parquet, without_seal
 from roadscan.store.records import OutputRecord, Packed, sound_rows, table_of
-from roadscan.store.seal import check_seal, sealed_parquet, without_seal
 from roadscan.store.store import Store
 
 TABLE = pa.table({"asset_id": [f"a{k}" for k in range(40)], "status": ["kept", "gone"] * 20, "size_m": [0.5] * 40})

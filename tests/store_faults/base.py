@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from roadscan.demo.demo_street import SPRING, edit_by_hand, prepare_street
+from roadscan.demo.demo import SPRING, edit_by_hand, prepare_street
 
 
 def prepare(folder: Path) -> None:

@@ -8,9 +8,21 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import generic_filter
 
 from roadscan.core.grid import TileGrid
-from roadscan.surface.coarse import FILLED, INTERPOLATED, MEASURED, NOTHING, CoarseSettings, Stretch, coarse_model
 from roadscan.surface.kernels.coarse import median_filter, natural_spline
-from roadscan.surface.regions import FOUND, STATED, RegionSettings, find_regions, stated_regions
+from roadscan.surface.regions import (
+    FILLED,
+    FOUND,
+    INTERPOLATED,
+    MEASURED,
+    NOTHING,
+    STATED,
+    CoarseSettings,
+    RegionSettings,
+    Stretch,
+    coarse_model,
+    find_regions,
+    stated_regions,
+)
 
 EAST, NORTH = 2_683_200.0, 1_247_900.0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.surface.holes import RIM, Holes, cells_across
+from roadscan.surface.reconstruction import RIM, Holes, cells_across
 
 
 def fill_holes(values: np.ndarray, known: np.ndarray, most: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

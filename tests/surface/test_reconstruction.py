@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileGrid, TileId
 from roadscan.surface import reconstruction
 from roadscan.surface.reconstruction import Patch, SurfaceGrid, surface_of
 from roadscan.surface.settings import SurfaceConfig, SurfaceSmoothing

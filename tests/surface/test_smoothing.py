@@ -9,8 +9,16 @@ from scipy.sparse.linalg import eigsh, spsolve
 
 from roadscan.core.errors import RoadscanError
 from roadscan.surface.detail_median import REACH, detail_median, detail_pairs, lines_onward
-from roadscan.surface.kernels.line_medians import judge_lines, line_means, line_medians, mirrored_line_medians
-from roadscan.surface.kernels.supports import CrackCells, Shapes, heights_by_support, least_risk
+from roadscan.surface.kernels.line_medians import (
+    CrackCells,
+    Shapes,
+    heights_by_support,
+    judge_lines,
+    least_risk,
+    line_means,
+    line_medians,
+    mirrored_line_medians,
+)
 from roadscan.surface.settings import SurfaceSmoothing
 from roadscan.surface.smoothing import FILTER_BOUND, Smoothing, halo_cells, smooth_surface, steps
 from tests.surface.patches import (

@@ -16,11 +16,10 @@ from PIL import Image
 from rasterio.enums import Resampling
 
 from roadscan.core.errors import ConfigError, StoreError
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileGrid, TileId
 from roadscan.store.codecs.mesh import write_glb
-from roadscan.surface.tile import EMPTY, INTERPOLATED, MEASURED, SurfaceTile
-from roadscan.surface.window import GridWindow
+from roadscan.surface.regions import INTERPOLATED, MEASURED
+from roadscan.surface.tile import EMPTY, GridWindow, SurfaceTile
 from roadscan.tiles.product import ProductContext, product_named
 from roadscan.tiles.products.mesh import mesh_of
 from tests.workshop import Place, Workshop

@@ -21,7 +21,7 @@ import rasterio
 import shapely
 
 from roadscan.core.errors import ConfigError
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Compute, Done, Inline
 from roadscan.run.selection import Selection
@@ -33,10 +33,11 @@ from roadscan.store.manifest import Manifest
 from roadscan.store.query.sql import query
 from roadscan.store.store import Store
 from roadscan.surface.reconstruction import patch_of_cells, surface_of
+from roadscan.surface.regions import FILLED, INTERPOLATED, MEASURED
 from roadscan.surface.stage import plan_surface_work
 from roadscan.surface.tasks.surface_plan import SURFACE, SurfacePlan, SurfaceTask, bridged_tiles
 from roadscan.surface.tasks.surfaces import _Cells, source_of
-from roadscan.surface.tile import EMPTY, FILLED, INTERPOLATED, MEASURED, SurfaceTile
+from roadscan.surface.tile import EMPTY, SurfaceTile
 from roadscan.survey.run import run_stages
 from roadscan.survey.status import verify_store
 from roadscan.tiles.tasks.tile_plan import TILE

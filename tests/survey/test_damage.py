@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from roadscan.cli import app
 from roadscan.core.errors import RoadscanError, RunError
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Inline
 from roadscan.run.selection import Selection

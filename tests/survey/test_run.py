@@ -19,8 +19,7 @@ from typer.testing import CliRunner
 from roadscan.cli import app
 from roadscan.cli.added_stages import _stated
 from roadscan.core.errors import ConfigError, RunError
-from roadscan.core.grid import Bounds
-from roadscan.core.ids import TileId
+from roadscan.core.grid import Bounds, TileId
 from roadscan.core.survey import Survey
 from roadscan.ingest.ingest import ingest
 from roadscan.run.engine.compute import Inline

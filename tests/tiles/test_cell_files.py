@@ -11,8 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from roadscan.core.errors import StoreError
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileGrid, TileId
 from roadscan.georeference.cloud import TilePoints
 from roadscan.ingest.inspect.inspect import inspect
 from roadscan.store.codecs.parquet.number_table import Lists, write_number_groups

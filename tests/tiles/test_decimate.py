@@ -7,8 +7,7 @@ import pytest
 
 from roadscan.compute.kernel_options import read_only
 from roadscan.core.errors import ConfigError
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileGrid, TileId
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.kernels.decimate import Cells, Squares, decimate_cells
 from roadscan.tiles.kernels.decimate_2x2 import decimate_2x2

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from roadscan.core.errors import ConfigError
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.pyramid import Level, overview_factors, pyramid_of
 

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileGrid, TileId
 from roadscan.georeference.cloud import TilePoints
 from roadscan.georeference.kernels.readings import CLASS_KEPT, CLASS_TOO_HIGH, FATES, KEPT, OUTSIDE, Placed
 from roadscan.tiles.accumulator import Accumulator

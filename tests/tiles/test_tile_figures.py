@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.georeference.reading_counts import LogCounts
 from roadscan.run.engine.fingerprint import key_of, keys_beside
 from roadscan.store.manifest import CHANGED, DAMAGED, MISSING, Manifest, OutputRecord

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.tiles.tasks.tile_plan import PlannedTiles
 
 

@@ -17,13 +17,13 @@ from typer.testing import CliRunner
 
 import roadscan as rs
 from roadscan.cli import app
-from roadscan.pictures.clicked import FILE
+from roadscan.pictures.points import FILE
 from roadscan.run.session import Session
 from roadscan.simulate import simulate
 from roadscan.site.doors import doors_of
 from roadscan.site.live import LiveSite, open_survey
 from roadscan.site.material import Material, Wishes
-from roadscan.site.parts.measuring import Measuring
+from roadscan.site.parts.edits import Measuring
 from roadscan.site.server import SiteServer
 from tests.pictures.test_picture_targets import PLATES, SMALL, STREET, TARGETS
 from tests.serving import serving

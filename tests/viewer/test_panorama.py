@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 import roadscan as rs
 from roadscan.simulate import simulate, truth
-from roadscan.simulate.earth import Earth
+from roadscan.simulate.path import Earth
 from roadscan.site.live import LiveSite, open_survey
 from roadscan.site.server import SiteServer
 from tests.serving import serving

@@ -20,9 +20,8 @@ import numpy as np
 from roadscan.adjust.observations import CAMERA, COMPONENTS, FIXED, KINDS, MOUNTED, Observations
 from roadscan.compute.array_types import Bool, Float64, Int32, Int64
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.pictures.camera_changes import changed
 from roadscan.pictures.exposures import Exposures
-from roadscan.pictures.lens import PARAMETERS, derivatives, pixels_of, rays_of
+from roadscan.pictures.lens import PARAMETERS, changed, derivatives, pixels_of, rays_of
 from roadscan.pictures.ties.tracks import places_of
 from roadscan.pictures.views import Lens
 from roadscan.poses.trajectory import Corrections, world_from_ned

@@ -22,10 +22,10 @@ from roadscan.adjust.bundle.measurements import (
     rows_of,
     seen,
 )
+from roadscan.adjust.estimation import igg_iii
 from roadscan.adjust.observations import KINDS, Observations
 from roadscan.adjust.process import CameraPrior, MountingPrior, RunPrior
-from roadscan.adjust.solver_settings import AdjustmentSettings
-from roadscan.adjust.weights import igg_iii
+from roadscan.adjust.settings import AdjustmentSettings
 from roadscan.calibrate.robust import length_limit
 from roadscan.compute.array_types import Bool, Float64, Int64
 

@@ -7,10 +7,8 @@ from typing import Final, Literal
 
 import numpy as np
 
-from roadscan.adjust.targets.heights import height_at
-from roadscan.adjust.targets.settings import TargetSettings
-from roadscan.adjust.targets.shapes import SurveyedLine
-from roadscan.adjust.targets.values import HeightFind, TargetReadings
+from roadscan.adjust.settings import TargetSettings
+from roadscan.adjust.targets.shapes import HeightFind, SurveyedLine, TargetReadings, height_at
 from roadscan.compute.array_types import Bool, Float64
 from roadscan.compute.edges.painted_line import LINE_M, painted_line, without_lines
 from roadscan.compute.robust import scatter_about

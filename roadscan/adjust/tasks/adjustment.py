@@ -9,16 +9,14 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from roadscan.adjust.bundle.picture import residuals_of
-from roadscan.adjust.control.control import ControlPoint, Sighting
-from roadscan.adjust.control.control_faults import NAMED
+from roadscan.adjust.bundle.outcome import residuals_of
+from roadscan.adjust.control import NAMED, ControlPoint, Sighting
 from roadscan.adjust.picture import AdjustmentPicture, Residuals
 from roadscan.adjust.places import Place, Track, places_of_overlap
 from roadscan.adjust.process import RunPrior
 from roadscan.adjust.quality import NSSDA_CHECK_POINTS
-from roadscan.adjust.settings import AdjustConfig
+from roadscan.adjust.settings import AdjustConfig, PlaceSettings
 from roadscan.adjust.tasks.bundle import AskedOfPictures, pictures_key, pictures_of
-from roadscan.adjust.tasks.camera_priors import asks_pictures
 from roadscan.adjust.tasks.cameras import (
     camera_findings,
     picture_findings,
@@ -26,31 +24,21 @@ from roadscan.adjust.tasks.cameras import (
     picture_rows,
     publish_cameras,
 )
-from roadscan.adjust.tasks.control_lines import lines_line
 from roadscan.adjust.tasks.control_work import (
     SIGHTINGS,
     ControlTask,
     control_points,
     control_tasks,
+    lines_line,
     load_sightings,
     sight_control,
 )
 from roadscan.adjust.tasks.doubts import CONTROL, CONTROL_PLACE, CORRECTED_ELSEWHERE, target_findings
-from roadscan.adjust.tasks.edge_scores import SCORES
-from roadscan.adjust.tasks.figures import (
-    Held,
-    Rows,
-    accuracy_rows,
-    control_rows,
-    distance_rows,
-    of_points,
-    relative_rows,
-    tie_rows,
-)
+from roadscan.adjust.tasks.edge_scores import RETURNS, SCORES
 from roadscan.adjust.tasks.hand_ties import HandWork, hand_file, hand_work, with_hand_ties
-from roadscan.adjust.tasks.heads import COMMON_M, exchanged, head_findings, odd_steps, seams, steps_of
 from roadscan.adjust.tasks.mountings import (
     Mounted,
+    asks_pictures,
     calibrated_sigma,
     held_values,
     mounted_of,
@@ -67,11 +55,22 @@ from roadscan.adjust.tasks.outcome import (
     failed_ties,
     keep_pictures,
     keep_tables,
+    shown_seams,
 )
-from roadscan.adjust.tasks.publication import digests_of, foreign_runs, publish
-from roadscan.adjust.tasks.seams import shown_seams
+from roadscan.adjust.tasks.publication import (
+    Held,
+    Rows,
+    accuracy_rows,
+    control_rows,
+    digests_of,
+    distance_rows,
+    foreign_runs,
+    of_points,
+    publish,
+    relative_rows,
+    tie_rows,
+)
 from roadscan.adjust.tasks.solution import Evidence, Solution, priors_of, solve
-from roadscan.adjust.tasks.tie_depths import RETURNS
 from roadscan.adjust.tasks.tie_work import (
     TIES,
     KnownTies,
@@ -83,8 +82,17 @@ from roadscan.adjust.tasks.tie_work import (
     tie_tasks,
 )
 from roadscan.adjust.tasks.ties_again import Again, first_ties, settled
-from roadscan.adjust.tasks.tracks import adjusted_sources, runs_of, tracks_of
-from roadscan.adjust.tie_settings import PlaceSettings
+from roadscan.adjust.tasks.tracks import (
+    COMMON_M,
+    adjusted_sources,
+    exchanged,
+    head_findings,
+    odd_steps,
+    runs_of,
+    seams,
+    steps_of,
+    tracks_of,
+)
 from roadscan.adjust.walls import lean_findings, leans
 from roadscan.compute.array_types import Float64
 from roadscan.core.counted import counted as count_of

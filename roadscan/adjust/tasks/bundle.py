@@ -8,18 +8,26 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from roadscan.adjust.bundle.measurements import Measurements, Numbers
-from roadscan.adjust.bundle.settings import CameraPriors
 from roadscan.adjust.bundle.solve import PictureEvidence
-from roadscan.adjust.control.control import ControlPoint
+from roadscan.adjust.control import ControlPoint
 from roadscan.adjust.process import CameraPrior
-from roadscan.adjust.settings import AdjustConfig
-from roadscan.adjust.tasks.camera_priors import adjusted_cameras, asks_pictures, camera_sigma
-from roadscan.adjust.tasks.edge_scores import SCORES, EdgeTask, edge_tasks, load_boresights, write_scores
-from roadscan.adjust.tasks.mountings import Mounted
-from roadscan.adjust.tasks.tie_depths import RETURNS, DepthTask, depth_tasks, load_returns, write_returns
+from roadscan.adjust.settings import AdjustConfig, CameraPriors
+from roadscan.adjust.tasks.edge_scores import (
+    RETURNS,
+    SCORES,
+    DepthTask,
+    EdgeTask,
+    depth_tasks,
+    edge_tasks,
+    load_boresights,
+    load_returns,
+    write_returns,
+    write_scores,
+)
+from roadscan.adjust.tasks.mountings import Mounted, adjusted_cameras, asks_pictures, camera_sigma
 from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.counted import listed
-from roadscan.core.ids import of_run
+from roadscan.core.grid import of_run
 from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory_source
 from roadscan.georeference.plan.road import road_key
 from roadscan.georeference.sources import load_mountings
@@ -27,7 +35,7 @@ from roadscan.navigation.tasks.clock_tables import load_clocks
 from roadscan.pictures.exposures import Exposures, exposures_of
 from roadscan.pictures.frames.chosen import camera_pictures
 from roadscan.pictures.points import TABLE, measured_points
-from roadscan.pictures.ties.chains import TRACKS
+from roadscan.pictures.ties.tracks import TRACKS
 from roadscan.pictures.ties.work import ALL
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.store import Store

@@ -8,13 +8,12 @@ from typing import Any, Final
 import numpy as np
 
 from roadscan.adjust.adjustment import CameraErrors
-from roadscan.adjust.bundle.outcome import ControlOfPictures, PictureOutcome
-from roadscan.adjust.bundle.self_check import FreeCameras
+from roadscan.adjust.bundle.outcome import ControlOfPictures, FreeCameras, PictureOutcome
 from roadscan.adjust.tasks.edge_scores import BORESIGHTS, boresight_findings, boresight_lines, boresight_rows
-from roadscan.adjust.tasks.figures import Rows
+from roadscan.adjust.tasks.publication import Rows
 from roadscan.core.counted import counted
 from roadscan.core.witness import Finding, Witness
-from roadscan.pictures.camera_changes import COLUMNS, JOINT, JOINT_TABLE, TABLE
+from roadscan.pictures.lens import COLUMNS, JOINT, JOINT_TABLE, TABLE
 from roadscan.store.small_tables import read_small, small_path, write_small
 from roadscan.store.store import Store
 

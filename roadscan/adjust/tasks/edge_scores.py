@@ -2,43 +2,232 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 
-from roadscan.adjust.bundle.edge_boresight import EdgeBoresight, Sighted, boresight_of
+from roadscan.adjust.bundle.depths import NearReturns
+from roadscan.adjust.bundle.edge_boresight import (
+    OTHERS,
+    TURNS_DEG,
+    EdgeBoresight,
+    EdgeScores,
+    Sighted,
+    boresight_of,
+    scores_of,
+)
 from roadscan.adjust.bundle.measurements import Numbers
-from roadscan.adjust.bundle.range_edges import OTHERS, TURNS_DEG, EdgeScores, scores_of
-from roadscan.adjust.bundle.settings import CameraPriors
-from roadscan.adjust.tasks.camera_priors import camera_sigma
-from roadscan.adjust.tasks.mountings import DOUBTED, Mounted
-from roadscan.adjust.tasks.near import NearFile
-from roadscan.adjust.tasks.tie_depths import chosen_pictures, lidars_of, readings_about
+from roadscan.adjust.settings import CameraPriors
+from roadscan.adjust.tasks.mountings import DOUBTED, Mounted, camera_sigma
+from roadscan.adjust.tasks.near import NearFile, placed_readings
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.counted import counted
+from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.plan.road import road_key
-from roadscan.georeference.sources import MapSettings
+from roadscan.georeference.sources import Georeferencer, MapSettings, ReadingSource, geometry_of, read_rows
 from roadscan.pictures.exposures import Exposures
-from roadscan.pictures.files import read_picture
+from roadscan.pictures.frames.chosen import read_picture
+from roadscan.pictures.lens import pixels_of
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.codecs.image_files import ImageError
 from roadscan.store.digest import bytes_digest
+from roadscan.store.logs import DataFile
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.store.writer import parquet_bytes
 
+RETURNS: Final = "tie_returns"
+"""Table, and product of its files in the manifest."""
+_BATCH_NS: Final = 4 * NS_PER_S
+"""Pictures of this long (ns) are one task: their returns lie in the same row groups."""
+_MOMENT_NS: Final = 60_000_000
+"""Returns so long before and after a picture (ns) are of its moment: a turn of a lidar at 10 Hz takes 100 ms."""
+_MOST_PICTURES: Final = 2_000
+"""Pictures of a survey that get depths, at most: their returns lie in memory while the adjustment is solved."""
+_MOST_POINTS: Final = 80
+"""Tie points of a picture that get a depth, at most."""
+_BESIDE_PX: Final = 16.0
+"""Returns so near to a tie point in the picture (px) are kept, and beyond it three σ of the boresight."""
+
+
+@dataclass(frozen=True)
+class DepthTask:
+    """Some pictures of a camera, and the row groups of a lidar of their moments. It carries no returns."""
+
+    store: Store
+    ground: MapSettings
+    exposures: Exposures
+    pixels: tuple[Float64, ...]
+    """(m, 2) tie points of each picture."""
+    near_px: float
+    reach_m: float
+    files: tuple[NearFile, ...]
+    numbers: tuple[int, ...]
+    """Of the pictures among all exposures."""
+    lidar: str
+    unit: str
+    key: str
+
+
+def depth_tasks(
+    plan: SurveyPlan, exposures: Exposures, tied: tuple[Int64, Float64], priors: CameraPriors,
+    boresight_sigma: Callable[[str], float],
+) -> list[DepthTask]:  # fmt: skip
+    """Returns a task for each camera, lidar and some seconds.
+
+    Parameters
+    ----------
+    tied : picture (m,) and pixel (m, 2) of each measurement of a tie point.
+    boresight_sigma : 1 σ (rad) of the boresight of a camera.
+    """
+    if not priors.depths:
+        return []
+    picture, pixel = tied
+    order = np.argsort(picture, kind="stable")
+    starts = np.searchsorted(picture[order], np.arange(len(exposures) + 1))
+    chosen = chosen_pictures(exposures, np.diff(starts) > 0, priors.depth_every_m, _MOST_PICTURES)
+    lidars = lidars_of(plan)
+    batch = exposures.epoch_gps_ns[chosen] // _BATCH_NS
+    cuts = np.flatnonzero((np.diff(batch) != 0) | (np.diff(exposures.camera[chosen]) != 0)) + 1
+    code, tasks = code_digest(f"{__name__}:write_returns"), []
+    for rows in np.split(chosen, cuts) if chosen.size else []:
+        own = exposures.at(rows)
+        camera = own.cameras[int(own.camera[0])]
+        pixels = tuple(_spread(pixel[order[starts[k] : starts[k + 1]]]) for k in rows.tolist())
+        spans = [(int(t) - _MOMENT_NS, int(t) + _MOMENT_NS) for t in own.epoch_gps_ns]
+        near_px = _BESIDE_PX + 3.0 * boresight_sigma(camera.sensor) * float(camera.lens.parameters[:2].max())
+        for (run, lidar), own_files in lidars.items():
+            near = [NearFile.of(source, file, spans) for source, file in own_files] if run == camera.run else []
+            there = tuple(one for one in near if one is not None)
+            if not there:
+                continue
+            posed = (own.body_world_m, own.world_from_body, own.lever_body_m, own.body_from_opencv)
+            shaping = [v.round(6).tobytes().hex() for v in (*posed, *pixels)]
+            key = key_of(
+                code, [one.key(road_key(one.source)) for one in there], own.epoch_gps_ns.tolist(), own.file.tolist(),
+                shaping, camera.lens.parameters.tolist(), near_px, priors.depth_reach_m,
+            )  # fmt: skip
+            unit = key_of(camera.run, camera.sensor, camera.log, lidar, int(own.epoch_gps_ns[0] // _BATCH_NS))
+            tasks.append(
+                DepthTask(
+                    plan.store, plan.ground, own, pixels, near_px, priors.depth_reach_m, there,
+                    tuple(rows.tolist()), lidar, unit, key,
+                )
+            )  # fmt: skip
+    return tasks
+
+
+def lidars_of(plan: SurveyPlan) -> dict[tuple[str, str], list[tuple[ReadingSource, DataFile]]]:
+    """Returns the files of lidars by run and sensor."""
+    lidars: dict[tuple[str, str], list[tuple[ReadingSource, DataFile]]] = {}
+    for source, files in sorted(plan.sources, key=lambda pair: (pair[0].run, pair[0].sensor, pair[0].key)):
+        if source.table == "returns" and source.trajectory is not None:
+            lidars.setdefault((source.run, source.sensor), []).extend((source, f) for f in files if f.group_spans)
+    return lidars
+
+
+def chosen_pictures(exposures: Exposures, usable: npt.NDArray[np.bool_], every_m: float, most: int) -> Int64:
+    """Returns numbers of usable pictures that lie some way apart, by camera and time; `most` of them."""
+    found = []
+    for camera in range(len(exposures.cameras)):
+        rows = np.flatnonzero((exposures.camera == camera) & usable)
+        rows = rows[np.argsort(exposures.epoch_gps_ns[rows], kind="stable")]
+        way = np.linalg.norm(np.diff(exposures.eye_world_m[rows], axis=0), axis=1)
+        along = np.concatenate([np.zeros(min(rows.size, 1)), np.cumsum(way)])
+        found.append(rows[np.unique(np.floor(along / every_m), return_index=True)[1]])
+    chosen = np.concatenate([np.zeros(0, np.int64), *found])
+    return chosen[:: max(1, -(-chosen.size // most))]
+
+
+def _spread(pixel: Float64) -> Float64:
+    """Returns some of the pixels (m, 2), evenly by their tie points."""
+    return pixel[:: max(1, -(-len(pixel) // _MOST_POINTS))]
+
+
+def write_returns(task: DepthTask) -> OutputRecord:
+    """Find the returns about the tie points of pictures and write them (runs on a worker)."""
+    count = len(task.exposures)
+    parts: list[list[Float64]] = [[] for _ in range(count)]
+    for points_m, epochs_gps_ns in readings_about(task.store, task.ground, task.files):
+        for k in range(count):
+            parts[k].append(_near(task, k, points_m, epochs_gps_ns))
+    points = [np.concatenate([np.zeros((0, 3)), *own]) for own in parts]
+    names = np.repeat(task.exposures.file.astype(str), [len(own) for own in points])
+    joined = np.concatenate(points)
+    schema = table_schema(RETURNS)
+    columns = [pa.array(names.tolist(), pa.string()), *(pa.array(column, pa.float32()) for column in joined.T)]
+    content = parquet_bytes(pa.Table.from_arrays(columns, schema=schema.arrow()), schema)
+    target = f"{schema.location}/{task.unit}.parquet"
+    task.store.write_bytes(target, content, lasting=False)
+    return OutputRecord(RETURNS, task.unit, task.key, target, len(content), bytes_digest(content))
+
+
+def readings_about(store: Store, ground: MapSettings, files: Sequence[NearFile]) -> Iterator[tuple[Float64, Int64]]:
+    """Yields returns (n, 3) of row groups in the map by the recorded poses, with their epochs (n,)."""
+    placer = Georeferencer(store, ground, [one.slice for one in files], recorded=True)
+    for file in files:
+        for group in file.groups:
+            rows = read_rows(store, file.source, file.path, [group]).combine_chunks()
+            for batch in rows.to_batches():
+                placed = placed_readings(batch, geometry_of(file.source), placer.placement(file.source))
+                yield placed.points_m, placed.epoch_gps_ns[placed.row]
+
+
+def _near(task: DepthTask, k: int, points_m: Float64, epochs_gps_ns: Int64) -> Float64:
+    """Returns the returns (n, 3) of a picture's moment near its tie points, in the axes of the body."""
+    from scipy.spatial import cKDTree
+
+    own = task.exposures
+    camera = own.cameras[int(own.camera[k])]
+    now = np.flatnonzero(np.abs(epochs_gps_ns - own.epoch_gps_ns[k]) <= _MOMENT_NS)
+    if not now.size:
+        return np.zeros((0, 3))
+    world = task.ground.map.world_from_map(camera.world, points_m[now])
+    body = (world - own.body_world_m[k]) @ own.world_from_body[k]
+    seen = (body - own.lever_body_m[k]) @ own.body_from_opencv[k]
+    near = np.flatnonzero((seen[:, 2] > 0.5) & (np.einsum("ni,ni->n", seen, seen) < task.reach_m**2))
+    pixel = pixels_of(camera.lens, seen[near])
+    near, pixel = near[np.isfinite(pixel).all(axis=1)], pixel[np.isfinite(pixel).all(axis=1)]
+    away, _ = cKDTree(task.pixels[k]).query(pixel, distance_upper_bound=task.near_px)
+    return np.asarray(body[near[np.isfinite(away)]])
+
+
+def load_returns(
+    manifest: Manifest, tasks: Sequence[DepthTask], mounted: Mounted, plan: SurveyPlan
+) -> tuple[NearReturns, ...]:
+    """Returns what the tasks found, picture by picture."""
+    return tuple(one for task in tasks for one in _loaded(manifest, task, mounted, plan))
+
+
+def _loaded(manifest: Manifest, task: DepthTask, mounted: Mounted, plan: SurveyPlan) -> Iterator[NearReturns]:
+    record = manifest.get(RETURNS, task.unit)
+    if record is None or not record.path:
+        return
+    rows = recorded_table(plan.store, record)
+    point = np.stack([rows.column(c).to_numpy() for c in ("forward_m", "right_m", "down_m")], axis=-1)
+    names = np.array(rows.column("file").to_pylist(), dtype=object)
+    run = task.files[0].source.run
+    for k, number in enumerate(task.numbers):
+        stated = task.files[0].source.mountings.pieces(task.exposures.epoch_gps_ns[k : k + 1])
+        lever = np.array(next(mounting.lever_arm_body_m for _, mounting in stated), np.float64)
+        own = point[names == str(task.exposures.file[k])]
+        yield NearReturns(number, mounted.number(run, task.lidar), task.lidar, lever, own)
+
+
 SCORES: Final = "edge_scores"
 """Table, and product of its files in the manifest."""
 BORESIGHTS: Final = "edge_boresights"
-_MOMENT_NS: Final = 50_000_000
+_EDGE_SCORES_MOMENT_NS: Final = 50_000_000
 """Returns so long before and after a picture (ns) are of its moment: one turn of a lidar at 10 Hz."""
-_MOST_PICTURES: Final = 60
+_EDGE_SCORES_MOST_PICTURES: Final = 60
 """Pictures that are compared, at most, spread over the survey: some dozen tell the boresight to what all edges have in
 common."""
 _EVERY_M: Final = 0.25
@@ -79,10 +268,10 @@ def edge_tasks(plan: SurveyPlan, exposures: Exposures, priors: CameraPriors) -> 
     around = np.array([camera.lens.is_around for camera in exposures.cameras], bool)
     usable = ~around[exposures.camera] if around.size else np.zeros(0, bool)
     lidars, code, tasks = lidars_of(plan), code_digest(f"{__name__}:write_scores"), []
-    for number in chosen_pictures(exposures, usable, _EVERY_M, _MOST_PICTURES).tolist():
+    for number in chosen_pictures(exposures, usable, _EVERY_M, _EDGE_SCORES_MOST_PICTURES).tolist():
         own = exposures.at(np.array([number]))
         camera, epoch = own.cameras[int(own.camera[0])], int(own.epoch_gps_ns[0])
-        span = [(epoch - _MOMENT_NS, epoch + _MOMENT_NS)]
+        span = [(epoch - _EDGE_SCORES_MOMENT_NS, epoch + _EDGE_SCORES_MOMENT_NS)]
         for (run, lidar), files in lidars.items():
             near = [NearFile.of(source, file, span) for source, file in files] if run == camera.run else []
             there = tuple(one for one in near if one is not None)
@@ -109,7 +298,7 @@ def write_scores(task: EdgeTask) -> OutputRecord:
     camera = own.cameras[int(own.camera[0])]
     parts = [np.zeros((0, 3))]
     for points_m, epochs_gps_ns in readings_about(task.store, task.ground, task.files):
-        now = np.abs(epochs_gps_ns - own.epoch_gps_ns[0]) <= _MOMENT_NS
+        now = np.abs(epochs_gps_ns - own.epoch_gps_ns[0]) <= _EDGE_SCORES_MOMENT_NS
         world = task.ground.map.world_from_map(camera.world, points_m[now])
         body = (world - own.body_world_m[0]) @ own.world_from_body[0]
         seen = (body - own.lever_body_m[0]) @ own.body_from_opencv[0]
@@ -152,12 +341,12 @@ def load_boresights(
             camera_name, lidar, seat, lidar_seat, int(numbers.camera[int(exposure.camera[0])]),
             exposure.body_from_opencv[0], sigma, plan.survey.rig.sensors[camera_name].boresight_sigma_deg is None,
         )  # fmt: skip
-        scores = [one for task in own for one in _loaded(manifest, task, plan.store)]
+        scores = [one for task in own for one in _edge_scores_loaded(manifest, task, plan.store)]
         found.append(boresight_of(sighted, scores, float(np.radians(priors.sigma_shared_edge_deg))))
     return tuple(found)
 
 
-def _loaded(manifest: Manifest, task: EdgeTask, store: Store) -> list[EdgeScores]:
+def _edge_scores_loaded(manifest: Manifest, task: EdgeTask, store: Store) -> list[EdgeScores]:
     record = manifest.get(SCORES, task.unit)
     if record is None or not record.path:
         return []

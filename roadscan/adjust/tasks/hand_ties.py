@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.adjustment import Adjustment
-from roadscan.adjust.control.control import ControlPoint, Sighting
-from roadscan.adjust.control.control_test import quantile
+from roadscan.adjust.control import ControlPoint, Sighting
+from roadscan.adjust.control_test import quantile
 from roadscan.adjust.observations import KINDS, MOUNTED, Observations, mount_partials, partials
 from roadscan.adjust.patches import level_from_map
 from roadscan.adjust.places import Track, Traverse

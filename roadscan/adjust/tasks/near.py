@@ -26,7 +26,7 @@ from roadscan.georeference.sources import (
     geometry_of,
     read_rows,
 )
-from roadscan.poses.level import LevelPoses, level_poses
+from roadscan.poses.movement import LevelPoses, level_poses
 from roadscan.store.logs import DataFile
 from roadscan.store.store import Store
 

@@ -10,23 +10,28 @@ import numpy as np
 
 from roadscan.adjust.adjustment import Adjustment, CameraErrors, CommonErrors, ControlErrors, MountingErrors, adjust
 from roadscan.adjust.bundle.edge_boresight import edge_observations, widened
-from roadscan.adjust.bundle.outcome import PictureOutcome, outcome_of
-from roadscan.adjust.bundle.self_check import FreeCameras, free_cameras
+from roadscan.adjust.bundle.outcome import FreeCameras, PictureOutcome, free_cameras, outcome_of
 from roadscan.adjust.bundle.solve import Approached, PictureEvidence, approached
-from roadscan.adjust.control.control import ControlPoint, SeenBy, Sighting, observations_of
-from roadscan.adjust.control.control_faults import WrongPoint, datum_fault, far_in_height
-from roadscan.adjust.control.control_test import COMPONENTS as _AXES
-from roadscan.adjust.control.control_test import HEIGHT, PLACE
+from roadscan.adjust.control import (
+    ControlPoint,
+    SeenBy,
+    Sighting,
+    WrongPoint,
+    datum_fault,
+    far_in_height,
+    observations_of,
+)
+from roadscan.adjust.control_test import COMPONENTS as _AXES
+from roadscan.adjust.control_test import HEIGHT, PLACE
 from roadscan.adjust.helmert import RigidFit, rigid_fit
 from roadscan.adjust.observations import FIXED, MOUNTED, Observations
 from roadscan.adjust.patches import level_from_map
 from roadscan.adjust.process import CameraPrior, GaussMarkov, RunPrior, StatedSigma, knots_of
 from roadscan.adjust.quality import LeaveOneOut, leave_one_out
-from roadscan.adjust.settings import AdjustConfig, PosePriors
-from roadscan.adjust.solver_settings import AdjustmentSettings, ControlRules
+from roadscan.adjust.settings import AdjustConfig, AdjustmentSettings, ControlRules, PosePriors
 from roadscan.adjust.targets.shapes import SurveyedLine
 from roadscan.adjust.tasks.bundle import exposure_epochs, exposure_span
-from roadscan.adjust.tasks.control_lines import line_findings
+from roadscan.adjust.tasks.control_work import line_findings
 from roadscan.adjust.tasks.doubts import (
     CONTROL,
     CONTROL_DATUM,
@@ -34,6 +39,8 @@ from roadscan.adjust.tasks.doubts import (
     datum_figures,
     exchanged,
     far_points,
+    fixed_findings,
+    fixed_line,
     not_held,
     offset_findings,
     offset_line,
@@ -45,7 +52,6 @@ from roadscan.adjust.tasks.doubts import (
     time_line,
     wrong_points,
 )
-from roadscan.adjust.tasks.fixed import fixed_findings, fixed_line
 from roadscan.adjust.tasks.hand_ties import wrong_hand_ties
 from roadscan.adjust.tasks.mountings import Cause, Mounted, cause_line, causes, contradicted, disproved
 from roadscan.adjust.tasks.near import Sources
@@ -54,10 +60,8 @@ from roadscan.adjust.tasks.tracks import span_of
 from roadscan.compute.array_types import Bool, Float64, Int32, Int64
 from roadscan.core.witness import Finding
 from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
-from roadscan.navigation.tasks.pose_sigma import stated_pose_sigma
-from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded
-from roadscan.poses.level import level_poses
-from roadscan.poses.movement import NO_SEAT
+from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded, stated_pose_sigma
+from roadscan.poses.movement import NO_SEAT, level_poses
 from roadscan.poses.trajectory import Corrections
 
 _WIDENED: Final = 3

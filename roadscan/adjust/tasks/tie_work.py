@@ -15,9 +15,9 @@ from roadscan.adjust.adjustment import CommonErrors
 from roadscan.adjust.observations import COMMON, KINDS, MOUNTED, Observations, mount_partials
 from roadscan.adjust.patches import PassReadings, Shift, shifted
 from roadscan.adjust.places import Place, Traverse
+from roadscan.adjust.settings import TieSettings
 from roadscan.adjust.tasks.mountings import CHANCE, DETERMINED, Mounted
 from roadscan.adjust.tasks.near import Circle, NearFile, NearReader, Sources, near_files
-from roadscan.adjust.tie_settings import TieSettings
 from roadscan.adjust.ties.at_place import Ties, ties_at
 from roadscan.adjust.ties.tie import HEIGHT, LASERS, SAME_PASS
 from roadscan.core.gpstime import NS_PER_S

@@ -16,14 +16,13 @@ import numpy.typing as npt
 
 from roadscan.adjust.patches import Shift
 from roadscan.adjust.places import Place, Traverse
-from roadscan.adjust.settings import AdjustConfig
+from roadscan.adjust.settings import AdjustConfig, TieSettings
 from roadscan.adjust.tasks.control_work import ControlTask, sighting_tasks
 from roadscan.adjust.tasks.near import Sources
 from roadscan.adjust.tasks.solution import Solution, priors_of
 from roadscan.adjust.tasks.tie_work import KnownTies, TieTask, tie_tasks
 from roadscan.adjust.tasks.tracks import runs_of
-from roadscan.adjust.tie_settings import TieSettings
-from roadscan.adjust.ties.far_apart import agreeing, is_matched, misplaced, places_of_pairs
+from roadscan.adjust.ties.tie import agreeing, is_matched, misplaced, places_of_pairs
 from roadscan.compute.array_types import Bool, Float64
 from roadscan.core.counted import counted
 from roadscan.core.gpstime import NS_PER_S

@@ -13,9 +13,8 @@ import numpy.typing as npt
 from roadscan.adjust.observations import KINDS, Observations, partials
 from roadscan.adjust.patches import PassReadings, patch_of
 from roadscan.adjust.places import Place
-from roadscan.adjust.tie_settings import TieSettings
-from roadscan.adjust.ties.height import height_tie
-from roadscan.adjust.ties.plane import plane_ties
+from roadscan.adjust.settings import TieSettings
+from roadscan.adjust.ties.plane import height_tie, plane_ties
 from roadscan.adjust.ties.shift import KINDS_OF_PICTURES, Pictures, shift_ties
 from roadscan.adjust.ties.tie import SAME_PASS, Tie
 from roadscan.compute.array_types import Float64

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from roadscan.assets.scene import GroundModel
 from roadscan.core.errors import StoreError
 from roadscan.store.codecs.cog import Band, dense_image, write_cog
-from roadscan.store.codecs.gdal import raster_settings
+from roadscan.store.codecs.tiff import raster_settings
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.raster import about, height_unit
 

@@ -12,8 +12,7 @@ import numpy.typing as npt
 from roadscan.assets.classes import CLASS_NAMES
 from roadscan.assets.returns import Returns
 from roadscan.assets.scene import Box
-from roadscan.core.grid import QUANTA_PER_M, TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import QUANTA_PER_M, TileGrid, TileId
 from roadscan.georeference.cloud import TilePoints
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.las import LasOptions, write_las

@@ -13,8 +13,7 @@ from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.rig import UNMOUNTED, Mountings
 from roadscan.georeference.plan.plan import trajectory_source
 from roadscan.georeference.sensor_places import sensor_places
-from roadscan.navigation.tasks.pose_sigma import pose_sigma
-from roadscan.navigation.tasks.trajectories import TrajectorySource, load_trajectory
+from roadscan.navigation.tasks.trajectories import TrajectorySource, load_trajectory, pose_sigma
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.digest import bytes_digest
 from roadscan.store.small_tables import small_path

@@ -27,7 +27,7 @@ from roadscan.assets.tasks.plan import AssetPlan
 from roadscan.assets.tasks.shared import Shared
 from roadscan.assets.visibility import CELL_M, passes_in_sight
 from roadscan.core.errors import SchemaError
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.core.strict import Strict
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import reason_of

@@ -22,7 +22,7 @@ from roadscan.assets.tasks.plan import AssetPlan, cut_squares, grid_of, readings
 from roadscan.assets.tasks.shared import Shared
 from roadscan.assets.tiling import AssetGrid, Halos
 from roadscan.assets.upright.grown import roughness_of_road_m
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import reason_of
 from roadscan.run.engine.fingerprint import key_of

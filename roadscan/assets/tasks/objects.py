@@ -16,7 +16,7 @@ from roadscan.assets.object_table import objects_of_table, table_of_objects
 from roadscan.assets.tasks.evidence import EVIDENCE
 from roadscan.assets.tasks.kinds import WantedKind
 from roadscan.assets.tiling import AssetGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.core.strict import Strict
 from roadscan.run.engine.compute import damaged_file, reason_of
 from roadscan.run.engine.fingerprint import key_of

@@ -20,8 +20,7 @@ from roadscan.assets.tasks.picture_rule import picture_rule
 from roadscan.assets.tasks.plan import AssetPlan
 from roadscan.assets.tiling import AssetGrid
 from roadscan.core.errors import ConfigError, RunError
-from roadscan.core.grid import Bounds
-from roadscan.core.ids import TileId
+from roadscan.core.grid import Bounds, TileId
 from roadscan.pictures.placed import Pictures, plan_pictures
 from roadscan.run.code_reach import code_digest, name_of
 from roadscan.run.engine.fingerprint import key_of

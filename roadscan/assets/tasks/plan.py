@@ -17,8 +17,7 @@ from roadscan.assets.tasks.picture_rule import picture_rule
 from roadscan.assets.tasks.recognition import check_recognition
 from roadscan.assets.tiling import AssetGrid, Halos
 from roadscan.core.errors import ConfigError, nearest
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileGrid, TileId
 from roadscan.core.survey import Survey
 from roadscan.footprints.footprints import FootprintRanges
 from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source

@@ -21,7 +21,7 @@ from roadscan.assets.tiling import AssetGrid
 from roadscan.compute.array_types import Float64
 from roadscan.condition.road_line import RoadLine
 from roadscan.condition.tasks.lines import Roads
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded

@@ -21,7 +21,7 @@ from roadscan.assets.tasks.picture_work import CUT_OUTS, SEEN
 from roadscan.assets.tasks.plan import AssetPlan, plan_assets
 from roadscan.assets.tasks.sections import SECTIONS
 from roadscan.assets.tasks.tables import TABLES
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.footprints.footprints import footprints_of
 from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session

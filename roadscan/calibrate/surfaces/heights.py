@@ -20,7 +20,7 @@ from pydantic import Field
 
 from roadscan.calibrate.evidence import Seen, Ties, Traverse
 from roadscan.calibrate.kernels.surface_patches import MOMENTS, UNKNOWNS, Matches, match_patches, splat
-from roadscan.calibrate.surfaces.readings import Pieces, Placed, Readings, level_from_world, placed
+from roadscan.calibrate.surfaces.planes import Pieces, Placed, Readings, level_from_world, placed
 from roadscan.calibrate.unknowns import Estimate
 from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.errors import NavigationError

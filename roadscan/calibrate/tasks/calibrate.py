@@ -14,7 +14,7 @@ from roadscan.calibrate.unknowns import Estimate, ObjectPose
 from roadscan.core.errors import ConfigError, DamagedError, RunError, nearest
 from roadscan.core.extras import can_draw, need
 from roadscan.core.gpstime import gps_ns_from_utc
-from roadscan.core.ids import ALL_RUNS
+from roadscan.core.grid import ALL_RUNS
 from roadscan.core.settings.calibration import CalibrationSettings, ObjectEvidence, OverlapEvidence
 from roadscan.core.survey import Survey
 from roadscan.georeference.plan.plan import DatedMountings, SurveyPlan, plan_survey
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from roadscan.calibrate.estimator import Calibration, Prior
     from roadscan.calibrate.picture import CalibrationPicture
     from roadscan.calibrate.tasks.calibration_evidence import Collected
+
 
 Report = Callable[[str], None]
 
@@ -290,3 +291,26 @@ def _keep(store: Store, rows: list[dict[str, Any]], say: Report) -> None:
     known = [] if table is None else table.to_pylist()
     places = {tuple(row[c] for c in sort) for row in rows}
     write_small(store, "mountings", [*(row for row in known if tuple(row[c] for c in sort) not in places), *rows])
+
+
+def mounting_lines(store: Store) -> list[str]:
+    """Return a line for each calibrated mounting; none of a damaged table, which `roadscan verify` reports."""
+    try:
+        table = read_small(store, "mountings")
+    except DamagedError:
+        return []
+    picture = f"; picture {PICTURE}" if store.exists(PICTURE) else ""
+    lines = []
+    for row in [] if table is None else table.to_pylist():
+        lever = [row[f"sigma_lever_{a}_m"] for a in ("forward", "right", "down")]
+        angles = [row[f"sigma_{a}_deg"] for a in ("roll", "pitch", "heading")]
+        largest_m, largest_deg = (
+            max((v for v in own if v is not None), default=float("nan")) for own in (lever, angles)
+        )
+        held = f", not determined: {row['not_determined']}" if row["not_determined"] else ""
+        lines.append(
+            f"mounting of {row['sensor']} (runs {row['run']}): calibrated {row['estimated_at'] or ''} from "
+            f"{row['method'] or ''}, σ at most {1e3 * largest_m:.1f} mm and {largest_deg:.3f}°{held}"
+            f"{picture if row['calibration'] else ''}"
+        )
+    return lines

@@ -24,19 +24,17 @@ from roadscan.calibrate.estimator import Prior
 from roadscan.calibrate.evidence import Traverse
 from roadscan.calibrate.resection import Exposure, Measured, Resection, Target, project, resect
 from roadscan.compute.array_types import Float64
-from roadscan.core.camera import Interior
 from roadscan.core.errors import ConfigError, FormatError, RunError, nearest
 from roadscan.core.extras import cv2
 from roadscan.core.frames import body_from_axes, rph_from_rotation
-from roadscan.core.rig import Mounting, Rig, Sensor
+from roadscan.core.rig import Interior, Mounting, Rig, Sensor
 from roadscan.core.rig_text import update_rig_file
 from roadscan.core.settings.calibration import CalibrationSettings
 from roadscan.core.survey import Survey
 from roadscan.georeference.plan.plan import trajectory_source
 from roadscan.navigation.tasks.navigate import records_with_trajectories
-from roadscan.navigation.tasks.pose_sigma import pose_sigma
-from roadscan.navigation.tasks.taken_pictures import taken_pictures
-from roadscan.navigation.tasks.trajectories import load_trajectory
+from roadscan.navigation.tasks.recorded_pictures import taken_pictures
+from roadscan.navigation.tasks.trajectories import load_trajectory, pose_sigma
 from roadscan.store.logs import LogRecord
 from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.store import Store

@@ -9,24 +9,23 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
+from xml.sax.saxutils import escape
 
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.colours.cameras import eyes_m
 from roadscan.colours.ground import HALO_M, ground_of
-from roadscan.colours.mosaicking import blended
-from roadscan.colours.painting import PaintRule, Places, paint
+from roadscan.colours.painting import PaintRule, Places, blended, eyes_m, paint
 from roadscan.colours.settings import OrthophotoConfig
 from roadscan.colours.tasks.plan import ColourPlan, jsonable
 from roadscan.colours.tasks.share import PictureShare, Shares
 from roadscan.core.gpstime import NS_PER_S, utc_from_gps_ns
-from roadscan.core.grid import Bounds, TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import Bounds, TileGrid, TileId
 from roadscan.pictures.placed import Pictures
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.codecs.cog import Band, bytes_image, write_cog
+from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.store import Store
 from roadscan.tiles.blocks import Block
@@ -252,3 +251,52 @@ def _mean(band: npt.NDArray[np.uint8], factor: int) -> npt.NDArray[np.uint8]:
     known = parts > 0
     number = known.sum(axis=(1, 3))
     return np.where(number, np.rint(parts.sum(axis=(1, 3)) / np.maximum(number, 1)), 0).astype(np.uint8)
+
+
+MOSAIC: Final = "orthophoto_mosaic"
+UNIT: Final = "orthophoto"
+
+
+@dataclass(frozen=True)
+class Mosaic:
+    """The mosaic of a survey's orthophotos."""
+
+    key: str
+    tiles: tuple[TileId, ...]
+
+
+def plan_mosaic(manifest: Manifest, context: ProductContext, cell_m: float) -> Mosaic:
+    """Returns the mosaic of the orthophotos that are there."""
+    held = (TileId.parse(unit) for unit, one in manifest.of(ORTHOPHOTO).items() if one.path)
+    tiles = tuple(sorted(held, key=lambda t: (t.row, t.column)))
+    code = code_digest("roadscan.colours.tasks.orthophoto:write_mosaic")
+    return Mosaic(key_of(code, [str(t) for t in tiles], context.map, context.grid, cell_m), tiles)
+
+
+def write_mosaic(store: Store, mosaic: Mosaic, context: ProductContext, cell_m: float) -> OutputRecord:
+    """Write the VRT beside the files of the tiles; its numbers of pictures count in each tile for itself."""
+    grid = TileGrid(context.grid.size_m, cell_m)
+    box, edge = CellBox.around(mosaic.tiles, grid), grid.cells_per_edge
+    place = box.transform(replace(context, grid=grid))
+    lines = [
+        f'<VRTDataset rasterXSize="{box.width}" rasterYSize="{box.height}">',
+        f"<SRS>{escape(context.map.wkt())}</SRS>",
+    ]
+    lines.append("<GeoTransform>" + ", ".join(repr(float(v)) for v in place.to_gdal()) + "</GeoTransform>")
+    for number, band in enumerate(BANDS, start=1):
+        colour = band.description.capitalize() if number <= 3 else "Undefined"
+        lines.append(f'<VRTRasterBand dataType="Byte" band="{number}"><Description>{band.description}</Description>')
+        lines.append(f"<NoDataValue>0</NoDataValue><ColorInterp>{colour}</ColorInterp>")
+        for tile in mosaic.tiles:
+            left, right, top, bottom = box.tile_window(tile, edge)
+            size = f'xSize="{right - left}" ySize="{bottom - top}"'
+            lines.append(
+                f'<ComplexSource><SourceFilename relativeToVRT="1">{tile}.tif</SourceFilename>'
+                f'<SourceBand>{number}</SourceBand><SrcRect xOff="0" yOff="0" {size}/>'
+                f'<DstRect xOff="{left}" yOff="{top}" {size}/><NODATA>0</NODATA></ComplexSource>'
+            )
+        lines.append("</VRTRasterBand>")
+    content = "\n".join([*lines, "</VRTDataset>", ""]).encode()
+    target = f"products/{ORTHOPHOTO}/{UNIT}.vrt"
+    store.write_bytes(target, content, lasting=False)
+    return OutputRecord(MOSAIC, UNIT, mosaic.key, target, len(content), bytes_digest(content))

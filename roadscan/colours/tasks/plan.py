@@ -14,8 +14,7 @@ from roadscan.colours.depth import DepthRule
 from roadscan.colours.settings import ColoursConfig
 from roadscan.core.errors import ConfigError, RunError
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.core.grid import Bounds
-from roadscan.core.ids import TileId
+from roadscan.core.grid import Bounds, TileId
 from roadscan.core.survey import Survey
 from roadscan.footprints.footprints import FootprintRanges
 from roadscan.georeference.plan.plan import SurveyPlan

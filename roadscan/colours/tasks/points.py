@@ -11,14 +11,13 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.colours.normals import normals_of
+from roadscan.colours.depth import normals_of
 from roadscan.colours.painting import PaintRule, Places, paint
 from roadscan.colours.settings import ColoursConfig
 from roadscan.colours.tasks.plan import ColourPlan, jsonable
 from roadscan.colours.tasks.share import PictureShare, Shares
 from roadscan.core.gpstime import NS_PER_S, utc_from_gps_ns
-from roadscan.core.grid import QUANTUM_M
-from roadscan.core.ids import TileId
+from roadscan.core.grid import QUANTUM_M, TileId
 from roadscan.georeference.cloud import TilePoints
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import damaged_file, reason_of

@@ -9,8 +9,7 @@ import numpy as np
 
 from roadscan.colours.kernels.looks import Depths
 from roadscan.colours.painting import Palette
-from roadscan.colours.tasks.depths import Shown, read_shown
-from roadscan.colours.tasks.gains import PictureGains
+from roadscan.colours.tasks.depths import PictureGains, Shown, read_shown
 from roadscan.colours.tasks.plan import DEPTHS, ColourPlan, numbers_near
 from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.grid import Bounds

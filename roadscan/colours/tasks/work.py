@@ -7,14 +7,29 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from roadscan.colours.settings import ColoursConfig
-from roadscan.colours.tasks.depths import DepthTask, depth_task
-from roadscan.colours.tasks.gains import GAINS, PictureGains, plan_gains, read_gains, write_gains
-from roadscan.colours.tasks.mosaic import MOSAIC, UNIT, plan_mosaic, write_mosaic
-from roadscan.colours.tasks.orthophoto import ORTHOPHOTO, PICTURES_OF, PhotoPlan, plan_photos
+from roadscan.colours.tasks.depths import (
+    GAINS,
+    DepthTask,
+    PictureGains,
+    depth_task,
+    plan_gains,
+    read_gains,
+    write_gains,
+)
+from roadscan.colours.tasks.orthophoto import (
+    MOSAIC,
+    ORTHOPHOTO,
+    PICTURES_OF,
+    UNIT,
+    PhotoPlan,
+    plan_mosaic,
+    plan_photos,
+    write_mosaic,
+)
 from roadscan.colours.tasks.plan import DEPTHS, ColourPlan, plan_colours
 from roadscan.colours.tasks.points import POINTS, PointsPlan, plan_points
 from roadscan.colours.tasks.share import Shares
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.footprints.footprints import footprints_of
 from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session, found_once

@@ -34,8 +34,8 @@ from roadscan.compute.robust import scatter_about
 from roadscan.condition.index import ConditionIndex, Quantity, Value
 from roadscan.condition.kernels.steps import step_heights
 from roadscan.condition.lane_data import LaneData, Profile
-from roadscan.condition.of_sections.wheel_paths import bridged
-from roadscan.condition.profiles.quarter_car import SEVERE_M
+from roadscan.condition.profiles.profiles import SEVERE_M
+from roadscan.condition.wheel_paths import bridged
 
 _NEAR_M: Final = 0.1  # Lines are fitted from this distance …
 _FAR_M: Final = 0.5  # … to this distance before and behind a joint.

@@ -24,9 +24,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.condition.index import ConditionIndex, Quantity, Value
-from roadscan.condition.lane_data import LaneData
-from roadscan.condition.of_sections.whole_sections import noisy
-from roadscan.condition.on_lane.squares import RavelledSection, TextureSquares
+from roadscan.condition.lane_data import LaneData, RavelledSection, TextureSquares
+from roadscan.condition.wheel_paths import noisy
 
 _CM3_PER_M2: Final = 1e3
 """Volume per area (cm³/m²) of a mean depth of a millimetre."""

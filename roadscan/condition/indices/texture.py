@@ -2,7 +2,7 @@
 
 ISO 13473-1 takes heights at most 1 mm apart; `roadscan mpd` computes the mean profile depth from such a profile. Cells
 of 10 mm and less, with several readings each, show it nearly
-(:func:`roadscan.condition.on_lane.squares.texture_squares` says how). Coarser cells show the root mean square of the
+(:func:`roadscan.condition.lane_data.texture_squares` says how). Coarser cells show the root mean square of the
 texture alone, by the scatter of the readings within them.
 """
 

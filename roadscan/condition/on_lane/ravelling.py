@@ -13,7 +13,7 @@ import shapely
 
 from roadscan.compute.array_types import Bool, Float64
 from roadscan.compute.robust import SIGMA_OF_MAD, scatter_about
-from roadscan.condition.on_lane.squares import SQUARE_M, RavelledPatch, RavelledSection, TextureSquares
+from roadscan.condition.lane_data import SQUARE_M, RavelledPatch, RavelledSection, TextureSquares
 
 LEAST_RATIO: Final = 1.15
 """Least ratio of a square's texture to its section's; it also exceeds it by :data:`_SIGMAS` of the section's spread."""

@@ -12,8 +12,7 @@ import numpy.typing as npt
 from roadscan.compute.array_types import Float64
 from roadscan.condition.profiles.profiles import heights_of, stations_of
 from roadscan.core.errors import FormatError, ProfileError, RoadscanError, in_words
-from roadscan.store.codecs.erd import erd_text, is_erd, parse_erd
-from roadscan.store.codecs.profile_text import parse_columns
+from roadscan.store.codecs.road_profiles import erd_text, is_erd, parse_columns, parse_erd
 
 UNITS_M = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3, "ft": 0.3048, "in": 0.0254, "mil": 2.54e-5}
 """Units of stations and heights, in metres."""

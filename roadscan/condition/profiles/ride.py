@@ -1,18 +1,95 @@
-"""Response of a quarter car to longitudinal profiles, and its mean over any stretch."""
+"""Response of a quarter car to longitudinal profiles, and its mean over any stretch.
+
+International roughness index: travel of the golden car's suspension per metre of road, at 80 km/h.
+
+Sources: World Bank Technical Paper 46 (Sayers, Gillespie, Paterson 1986: equations, parameters, start, check table);
+Sayers, *On the calculation of IRI from longitudinal road profile* (1995: moving average of 250 mm). They are the
+public descriptions behind ASTM E1926 and AASHTO R 43; the texts of those standards were not at hand, and compliance
+with them is not claimed.
+
+Ride number: the rating from 0 to 5 that road users would give, estimated from the profile.
+
+RN = 5 · exp(−160 · PI), with the profile index PI the root mean square of the suspension's slope of a quarter car of
+its own at 80 km/h, behind the moving average of 250 mm; of two wheel paths the squares of PI are averaged. Source:
+Sayers and Karamihas, *Interpretation of Road Roughness Profile Data* (FHWA-RD-96-101, 1996), the public description
+behind ASTM E1489. Neither text was at hand: parameters and formula are those that are generally quoted from them, no
+published example was found to check against, and compliance is not claimed.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, TypeAlias, get_args
+from typing import Final, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.array_types import Float64
 from roadscan.condition.kernels.quarter_car import QuarterCar, roll
-from roadscan.condition.profiles.profiles import Breaks, breaks_of, fault_of, heights_of, stations_of
-from roadscan.condition.profiles.quarter_car import COARSEST_M, GOLDEN_CAR, RULES, rules_at, usual_step_m
-from roadscan.condition.profiles.segments import Segments
+from roadscan.condition.profiles.profiles import (
+    COARSEST_M,
+    GOLDEN_CAR,
+    RULES,
+    Breaks,
+    breaks_of,
+    fault_of,
+    heights_of,
+    quarter_car,
+    rules_at,
+    stations_of,
+    usual_step_m,
+)
+from roadscan.core.errors import ProfileError
+
+
+class Segments(NamedTuple):
+    """Beginnings and ends of segments."""
+
+    from_m: Float64
+    """(segments,) station of the beginning (m)."""
+    to_m: Float64
+    """(segments,) station of the end (m)."""
+
+
+def segments_of(
+    first_m: float, last_m: float, length_m: float | None = None, stations_m: Sequence[float] | None = None
+) -> Segments:
+    """Divide the way between two stations into segments.
+
+    Parameters
+    ----------
+    length_m : of each segment from `first_m` on; the last one may be shorter. One segment in all by default.
+    stations_m : ends of segments, in place of a length; what lies outside the profile is left out.
+
+    Raises
+    ------
+    ProfileError
+        where the length is not positive, both are given, or fewer than two stations meet the profile.
+    """
+    if length_m is not None and stations_m is not None:
+        raise ProfileError("a length of segments and fixed stations", expected="one of them")
+    if stations_m is not None:
+        ends: Float64 = np.unique(np.asarray(stations_m, np.float64))
+        if not np.isfinite(ends).all():
+            raise ProfileError(f"a station {ends[~np.isfinite(ends)][0]}", expected="finite numbers, in metres")
+        inside = (ends[1:] > first_m) & (ends[:-1] < last_m) if ends.size > 1 else np.zeros(0, bool)
+        if not inside.any():
+            raise ProfileError(
+                f"{ends.size} stations, none of whose segments meets the profile",
+                expected=f"two or more, between {first_m:g} and {last_m:g} m",
+            )
+        return Segments(ends[:-1][inside], ends[1:][inside])
+    if length_m is None:
+        return Segments(np.array([first_m]), np.array([last_m]))
+    if not 0.0 < length_m < np.inf:
+        raise ProfileError(f"segments of {length_m:g} m", expected="a finite length above 0 m")
+    # A remainder of less than a millionth of a segment is rounding.
+    count = max(1, int(np.ceil((last_m - first_m) / length_m - 1e-6)))
+    ends = np.asarray(first_m + length_m * np.arange(count + 1), np.float64)
+    ends[-1] = last_m
+    return Segments(ends[:-1], ends[1:])
+
 
 Note: TypeAlias = Literal["start", "gap", "jump", "step", "uneven", "short"]
 NOTES: Final[tuple[Note, ...]] = get_args(Note)
@@ -125,3 +202,82 @@ def ride(x_m: npt.ArrayLike, height_m: npt.ArrayLike, car: QuarterCar = GOLDEN_C
         tuple(fault_of(x, row, RULES) for row in heights),
         bool(np.isfinite(usual_m)),
     )
+
+
+LOCAL_M = 7.62
+"""Length of the rolling mean that shows localised roughness (25 feet; m)."""
+
+
+class SegmentIri(NamedTuple):
+    """IRI of segments, of several profiles."""
+
+    iri_m_per_km: Float64
+    """(profiles, segments); NaN where less than half of a segment was measured."""
+    measured_share: Float64
+    """(profiles, segments) share of the segment that was measured."""
+
+
+def iri_of(on: Ride, segments: Segments) -> SegmentIri:
+    """Return the IRI of segments, from the golden car's ride (:func:`roadscan.condition.profiles.ride.ride`)."""
+    means, shares = on.means(segments)
+    return SegmentIri(1e3 * means, shares)
+
+
+def rolling_iri(on: Ride, length_m: float = LOCAL_M) -> Float64:
+    """Return the IRI over `length_m` around each sample (profiles, n); NaN within half of it of the ends.
+
+    The continuous report of localised roughness, as AASHTO R 54 has it with 7.62 m (public descriptions).
+    """
+    half = 0.5 * length_m
+    found = np.full(on.response_m.shape, np.nan)
+    inside = (on.x_m - half >= on.x_m[0] - 1e-9) & (on.x_m + half <= on.x_m[-1] + 1e-9)
+    around = Segments(on.x_m[inside] - half, on.x_m[inside] + half)
+    found[:, inside] = iri_of(on, around).iri_m_per_km
+    return found
+
+
+def mean_roughness_index(iri_left_m_per_km: Float64, iri_right_m_per_km: Float64) -> Float64:
+    """Return the MRI (m/km): the mean of the IRI of two wheel paths (AASHTO R 43, public descriptions)."""
+    return 0.5 * (iri_left_m_per_km + iri_right_m_per_km)
+
+
+def half_car_ride(x_m: npt.ArrayLike, left_m: npt.ArrayLike, right_m: npt.ArrayLike) -> Ride:
+    """Return the golden car's ride on the mean of two wheel paths; its IRI is the half-car roughness index, HRI.
+
+    Bumps of one side that are dips of the other cancel, so HRI ≤ MRI (Sayers 1989, *Two quarter-car models for
+    defining road roughness: IRI and HRI*).
+    """
+    samples = np.size(x_m)
+    return ride(x_m, 0.5 * (heights_of(left_m, samples) + heights_of(right_m, samples)))
+
+
+RIDE_NUMBER_CAR = quarter_car(k1=5120.0, k2=390.0, c=17.0, mu=0.036)
+"""The car of the ride number."""
+
+
+class RideNumber(NamedTuple):
+    """Ride numbers of segments."""
+
+    ride_number: Float64
+    """(segments,) from 0 to 5; NaN where less than half of a segment was measured."""
+    profile_index: Float64
+    """(profiles, segments) PI, a slope."""
+    measured_share: Float64
+    """(profiles, segments) share of the segment that was measured."""
+
+
+def ride_number_ride(x_m: npt.ArrayLike, height_m: npt.ArrayLike) -> Ride:
+    """Return the ride of this index's car; parameters and errors as :func:`roadscan.condition.profiles.ride.ride`."""
+    return ride(x_m, height_m, RIDE_NUMBER_CAR, squared=True)
+
+
+def ride_number_of(on: Ride, segments: Segments) -> RideNumber:
+    """Return the ride number of one wheel path, or of several together, from the ride of its car."""
+    squares, shares = on.means(segments)
+    return RideNumber(ride_number(np.sqrt(squares)), np.sqrt(squares), shares)
+
+
+def ride_number(profile_index: Float64) -> Float64:
+    """Return the ride number (k,) of wheel paths together, from their profile indices (paths, k)."""
+    rating: Float64 = 5.0 * np.exp(-160.0 * np.sqrt(np.mean(profile_index**2, axis=0)))
+    return rating

@@ -17,12 +17,22 @@ import numpy.typing as npt
 
 from roadscan.compute.array_types import Float64
 from roadscan.compute.flags import runs_of
-from roadscan.condition.profiles.iri import LOCAL_M, half_car_ride, iri_of, mean_roughness_index, rolling_iri
 from roadscan.condition.profiles.profile_faults import NOTABLE, PROFILE_STEPS, SoundHeights, sound_heights, too_high_by
 from roadscan.condition.profiles.profiles import heights_of, raise_fault, stations_of
-from roadscan.condition.profiles.ride import NOTES, Ride, ride
-from roadscan.condition.profiles.ride_number import ride_number_of, ride_number_ride
-from roadscan.condition.profiles.segments import Segments, segments_of
+from roadscan.condition.profiles.ride import (
+    LOCAL_M,
+    NOTES,
+    Ride,
+    Segments,
+    half_car_ride,
+    iri_of,
+    mean_roughness_index,
+    ride,
+    ride_number_of,
+    ride_number_ride,
+    rolling_iri,
+    segments_of,
+)
 from roadscan.condition.profiles.texture import TextureSegment, TextureSettings, rms_texture_mm, texture_segments
 from roadscan.core.errors import ProfileError
 from roadscan.core.witness import Finding

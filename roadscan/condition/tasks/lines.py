@@ -28,13 +28,12 @@ from roadscan.condition.roads import Drive, StatedLine, find_roads
 from roadscan.condition.settings import ConditionConfig
 from roadscan.core.crs import MapFrame
 from roadscan.core.errors import ConfigError
-from roadscan.core.ids import LanePass, PassId
+from roadscan.core.grid import LanePass, PassId
 from roadscan.core.survey import Survey
 from roadscan.formats.vectors.road_lines import LineLayer, RoadLinesOptions, place_in_map, read_lines, sidecars
 from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
 from roadscan.ingest.reading.format import Reject
-from roadscan.navigation.tasks.pose_sigma import usual_pose_sigma
-from roadscan.navigation.tasks.trajectories import TrajectorySource
+from roadscan.navigation.tasks.trajectories import TrajectorySource, usual_pose_sigma
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.digest import file_digest

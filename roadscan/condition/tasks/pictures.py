@@ -16,8 +16,8 @@ from roadscan.compute.array_types import Float64
 from roadscan.condition.index import condition_indices
 from roadscan.condition.kernels.ruts import wire_places
 from roadscan.condition.lane_data import LaneData
-from roadscan.condition.of_sections.whole_sections import WholeSections
 from roadscan.condition.tasks.values import VALUES, Group, GroupTask, load_lane
+from roadscan.condition.wheel_paths import WholeSections
 from roadscan.core.canvas import empty_figure
 from roadscan.core.extras import can_draw
 from roadscan.run.code_reach import code_digest

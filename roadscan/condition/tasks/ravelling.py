@@ -14,8 +14,7 @@ import pyarrow as pa
 import shapely
 
 from roadscan.condition.indices.ravelling import looked_through
-from roadscan.condition.lane_data import LaneData
-from roadscan.condition.on_lane.squares import SQUARE_M, RavelledPatch, RavelledSection
+from roadscan.condition.lane_data import SQUARE_M, LaneData, RavelledPatch, RavelledSection
 from roadscan.condition.tasks.values import Group, GroupTask, load_lane
 from roadscan.core.canvas import empty_figure
 from roadscan.core.extras import can_draw

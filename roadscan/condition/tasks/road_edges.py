@@ -12,8 +12,9 @@ import numpy.typing as npt
 import pyarrow as pa
 import shapely
 
-from roadscan.condition.road_edges.find import KINDS
-from roadscan.condition.road_edges.on_road import (
+from roadscan.condition.edge_raster import tile_points
+from roadscan.condition.road_edges import (
+    KINDS,
     LEAD_M,
     RoadEdges,
     RoadStretch,
@@ -22,12 +23,10 @@ from roadscan.condition.road_edges.on_road import (
     road_edges,
     road_surfaces,
 )
-from roadscan.condition.road_edges.raster import tile_points
 from roadscan.condition.settings import ConditionConfig, RoadEdgesConfig
 from roadscan.condition.tasks.lines import Roads
 from roadscan.condition.tasks.tasks import PieceTask, tiles_beside
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileGrid, TileId
 from roadscan.core.survey import Survey
 from roadscan.formats.vectors.polygons import check_polygons, read_polygons
 from roadscan.formats.vectors.road_lines import sidecars

@@ -15,16 +15,14 @@ import pyarrow as pa
 
 from roadscan.compute.array_types import Float64
 from roadscan.condition.road_line import Lane, RoadLine
-from roadscan.condition.roughness_regions.intensity import normalised_intensity
-from roadscan.condition.roughness_regions.points import RoadPoints
-from roadscan.condition.roughness_regions.regions import Region, SectionRegions, find_regions
+from roadscan.condition.roughness_rasters import RoadPoints, normalised_intensity
+from roadscan.condition.roughness_regions import Region, SectionRegions, find_regions
 from roadscan.condition.settings import RoughnessRegionsConfig
 from roadscan.condition.tasks.lines import Roads
 from roadscan.condition.tasks.tasks import PieceTask, tiles_beside
 from roadscan.core.canvas import empty_figure
 from roadscan.core.extras import can_draw
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileGrid, TileId
 from roadscan.navigation.tasks.recorded_pictures import NOT_DRAWN
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import damaged_file, reason_of

@@ -10,8 +10,7 @@ import numpy as np
 import shapely
 
 from roadscan.condition.road_line import RoadLine
-from roadscan.core.grid import Bounds, TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import Bounds, TileGrid, TileId
 from roadscan.core.strict import Strict
 from roadscan.run.engine.compute import Compute, reason_of
 from roadscan.store.manifest import Manifest

@@ -14,12 +14,21 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import shapely
 
-from roadscan.condition.cracks_on_lane import PIECE_M, CrackOnLane, located
 from roadscan.condition.index import ConditionIndex, Value, condition_indices
-from roadscan.condition.lane_data import CrossSections, LaneData, Profile
-from roadscan.condition.on_lane.lines import LaneLines
-from roadscan.condition.on_lane.squares import TextureSquares, columns_of
-from roadscan.condition.road_edges.on_lane import EdgeRows, EdgesOnLane, edges_on_lane
+from roadscan.condition.lane_data import (
+    PIECE_M,
+    CrackOnLane,
+    CrossSections,
+    EdgeRows,
+    EdgesOnLane,
+    LaneData,
+    LaneLines,
+    Profile,
+    TextureSquares,
+    columns_of,
+    edges_on_lane,
+    located,
+)
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.settings import SectionConfig
 from roadscan.condition.survey_lane import window_m2

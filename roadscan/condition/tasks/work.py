@@ -18,7 +18,7 @@ from roadscan.condition.tasks.roughness_regions import (
     due_pieces,
     plan_pieces,
 )
-from roadscan.condition.tasks.sections import SECTIONS, SectionFiles, due_files, plan_sections
+from roadscan.condition.tasks.sections import SECTIONS, TILES, SectionFiles, due_files, due_tiles, plan_sections
 from roadscan.condition.tasks.stretches import (
     OF_STRETCHES,
     SURFACE_FILES,
@@ -26,9 +26,8 @@ from roadscan.condition.tasks.stretches import (
     due_stretches,
     plan_stretches,
 )
-from roadscan.condition.tasks.tile_summary import TILES, due_tiles
 from roadscan.condition.tasks.values import VALUES, Group, GroupTask, due_groups, plan_groups
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session
 from roadscan.store.manifest import OutputRecord

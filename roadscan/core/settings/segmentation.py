@@ -1,4 +1,4 @@
-"""Settings of what tells road readings from others (``roadscan.georeference.segmentation``, ``.range_filter``)."""
+"""Settings of what tells road readings from others (``roadscan.georeference.road_profiles``, ``.range_filter``)."""
 
 from __future__ import annotations
 

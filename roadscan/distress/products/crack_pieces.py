@@ -14,7 +14,8 @@ from roadscan.core.strict import Strict
 from roadscan.distress.cracks import CrackPiece, crack_pieces, halo_cells
 from roadscan.distress.settings import CrackDetection
 from roadscan.surface.heights import HeightWindow
-from roadscan.surface.tile import FILLED, SurfaceTile
+from roadscan.surface.regions import FILLED
+from roadscan.surface.tile import SurfaceTile
 from roadscan.tiles.product import ProductContext, SurfaceProduct
 from roadscan.tiles.products.geo_table import check_geo_table, read_geo_table, write_geo_table
 

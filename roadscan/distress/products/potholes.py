@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Final, cast
 import numpy as np
 import pyarrow as pa
 
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.core.strict import Strict
 from roadscan.distress.potholes import Pothole, PotholePiece, join_potholes
 from roadscan.distress.products.pothole_pieces import read_pieces

@@ -24,7 +24,7 @@ from roadscan.core.errors import ConfigError
 from roadscan.core.frames import ENU_FROM_NED, quaternion_from_rotation
 from roadscan.core.gpstime import utc_from_gps_ns
 from roadscan.export.export import Exported, published
-from roadscan.export.pictures.chosen import (
+from roadscan.export.pictures.copies import (
     Choice,
     LocalFrame,
     chosen_pictures,
@@ -35,8 +35,7 @@ from roadscan.georeference.picture_axes import map_from_ned
 from roadscan.measuring.measure import posed_pictures
 from roadscan.measuring.poses import PicturePoses
 from roadscan.pictures.lens import rays_of
-from roadscan.pictures.ties.chains import TRACKS
-from roadscan.pictures.ties.tracks import places_of
+from roadscan.pictures.ties.tracks import TRACKS, places_of
 from roadscan.pictures.ties.work import ALL
 from roadscan.pictures.views import Lens, Views
 from roadscan.run.session import Session

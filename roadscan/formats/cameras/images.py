@@ -28,8 +28,15 @@ from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
 from roadscan.ingest.reading.stamps import CALENDAR_SCALES, TIME, StampColumn, calendar_clock, parse_calendar
 from roadscan.ingest.reading.text_table import Kind, TextBlock, TextLayout, TextOptions, text_blocks, text_layout
-from roadscan.store.codecs.image_files import SUFFIXES, ImageError, ImageSize, image_size, is_image
-from roadscan.store.codecs.picture_tags import picture_tags, tags_in_words
+from roadscan.store.codecs.image_files import (
+    SUFFIXES,
+    ImageError,
+    ImageSize,
+    image_size,
+    is_image,
+    picture_tags,
+    tags_in_words,
+)
 
 FILE: Final = Quantity("file", "text", ("filename", "file_name", "image", "image_file", "name"))
 _TEXTS: Final = (".csv", ".txt", ".tsv")

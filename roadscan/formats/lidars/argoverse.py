@@ -25,7 +25,7 @@ import pyarrow as pa
 
 from roadscan.core.errors import FormatError, Missing, TimeSystemError
 from roadscan.core.toml_text import toml
-from roadscan.formats.lidars.returns_batch import returns_batch
+from roadscan.formats.lidars.packet_returns import returns_batch
 from roadscan.ingest.reading.column_table import unlisted_batches, unlisted_reason
 from roadscan.ingest.reading.format import NO_LEVER_ARM, Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import Sieve

@@ -45,7 +45,6 @@ from roadscan.compute.array_types import Int64
 from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.core.strict import Strict
 from roadscan.core.witness import Finding, Witness
-from roadscan.formats.lidars.dated_clock import TIME, clock_of, dated_clock
 from roadscan.formats.lidars.hesai_packets import (
     MODELS,
     RETURNS,
@@ -60,8 +59,8 @@ from roadscan.formats.lidars.hesai_packets import (
     odd_steps,
     posix_us,
 )
+from roadscan.formats.lidars.packet_returns import TIME, Gap, Turns, clock_of, dated_clock, gap_of, mean_rate
 from roadscan.formats.lidars.pcap import Datagram, Wanted, batches, capture_start, datagrams, need_one_sender
-from roadscan.formats.lidars.view_gaps import Gap, Turns, gap_of, mean_rate
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
 

@@ -39,7 +39,7 @@ from roadscan.core.errors import ConfigError, FormatError, Missing, TimeSystemEr
 from roadscan.core.gpstime import NS_PER_S, UNIT_NS, Clock, TimeSystem
 from roadscan.core.strict import Strict
 from roadscan.core.witness import Witness
-from roadscan.formats.lidars.returns_batch import returns_batch
+from roadscan.formats.lidars.packet_returns import returns_batch
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside
 from roadscan.ingest.reading.records import Sieve, options_of
 

@@ -20,7 +20,7 @@ from roadscan.core.errors import FormatError, Missing, TimeSystemError
 from roadscan.core.gpstime import NS_PER_S, Clock, TimeSystem
 from roadscan.core.strict import Strict
 from roadscan.core.toml_text import UNKNOWN
-from roadscan.formats.lidars.returns_batch import returns_batch
+from roadscan.formats.lidars.packet_returns import returns_batch
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import EpochReader, Sieve, few_rejects, options_of
 from roadscan.store.readings.packed_returns import EIGHT_TO_SIXTEEN_BITS

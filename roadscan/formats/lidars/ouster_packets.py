@@ -31,10 +31,10 @@ from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.core.strict import Strict
 from roadscan.core.toml_text import UNKNOWN
 from roadscan.core.witness import Finding, Witness
-from roadscan.formats.lidars.kernels.ouster import Layout, Optics, Returns, checksum_tables, checksums, decode
+from roadscan.formats.lidars.kernels.packets import Layout, Optics, Returns, checksum_tables, checksums, decode
 from roadscan.formats.lidars.ouster_metadata import LEGACY, PROFILES, OusterMetadata
+from roadscan.formats.lidars.packet_returns import returns_batch
 from roadscan.formats.lidars.pcap import Datagram
-from roadscan.formats.lidars.returns_batch import returns_batch
 from roadscan.ingest.reading.format import Item, LogSource, Rows
 from roadscan.ingest.reading.records import EpochReader, Sieve, few_rejects
 

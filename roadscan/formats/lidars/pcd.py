@@ -15,7 +15,7 @@ import numpy.typing as npt
 from roadscan.core.errors import ConfigError, FormatError, Missing, TimeSystemError
 from roadscan.core.gpstime import UNIT_NS, Clock
 from roadscan.core.strict import Strict
-from roadscan.formats.clouds.pcd_file import (
+from roadscan.formats.clouds.pcd_cloud import (
     TIMES,
     PcdHeader,
     Points,
@@ -26,7 +26,7 @@ from roadscan.formats.clouds.pcd_file import (
     sixteen_bits,
 )
 from roadscan.formats.clouds.reference_scan import Brightness
-from roadscan.formats.lidars.returns_batch import returns_batch
+from roadscan.formats.lidars.packet_returns import returns_batch
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import (
     AXES,

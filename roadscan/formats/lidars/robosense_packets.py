@@ -32,8 +32,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.core.errors import ConfigError
-from roadscan.formats.lidars.returns_batch import returns_batch
-from roadscan.formats.lidars.view_gaps import TURN, Gap, jumps, steps
+from roadscan.formats.lidars.packet_returns import TURN, Gap, jumps, returns_batch, steps
 from roadscan.store.readings.packed_returns import EIGHT_TO_SIXTEEN_BITS
 
 Bool: TypeAlias = npt.NDArray[np.bool_]

@@ -39,8 +39,8 @@ from roadscan.compute.array_types import Bool, Float32, Int32, Int64
 from roadscan.compute.kernel_options import read_only
 from roadscan.core.errors import ConfigError
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.formats.lidars.kernels.velodyne import Firings, Room, returned
-from roadscan.formats.lidars.view_gaps import TURN, Gap, jumps, mean_rate, steps, waits_ns
+from roadscan.formats.lidars.kernels.packets import Firings, Room, returned
+from roadscan.formats.lidars.packet_returns import TURN, Gap, jumps, mean_rate, steps, waits_ns
 from roadscan.store.readings.packed_returns import BEAMS, PACKED, Beams
 from roadscan.store.schema import table_schema
 

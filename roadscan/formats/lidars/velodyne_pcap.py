@@ -41,6 +41,7 @@ from roadscan.core.errors import ConfigError, FormatError, Missing, TimeSystemEr
 from roadscan.core.gpstime import NS_PER_S, TimeSystem
 from roadscan.core.strict import Strict
 from roadscan.core.witness import Finding, Witness
+from roadscan.formats.lidars.packet_returns import Gap, gap_of
 from roadscan.formats.lidars.pcap import Datagram, Wanted, capture_start, datagrams, need_one_sender
 from roadscan.formats.lidars.velodyne_hours import Hours, Start, first_hour_unix_s, leaps
 from roadscan.formats.lidars.velodyne_packets import (
@@ -58,16 +59,16 @@ from roadscan.formats.lidars.velodyne_packets import (
     odd_steps,
 )
 from roadscan.formats.lidars.velodyne_segments import (
+    SENTENCES,
     STEPPED,
     Parts,
+    Sentences,
     StepWatch,
     Verdict,
     hours_later,
     judged,
     reference,
 )
-from roadscan.formats.lidars.velodyne_sentences import SENTENCES, Sentences
-from roadscan.formats.lidars.view_gaps import Gap, gap_of
 from roadscan.ingest.reading.format import (
     Item,
     LogFormat,

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from roadscan.compute.array_types import Float64
 from roadscan.core.crs import crs_from_text
 from roadscan.core.errors import ConfigError, FormatError, Missing
-from roadscan.formats.trajectories.level_poses import GEODETIC, GRID, LOCAL, SIGMAS, position_of
+from roadscan.formats.trajectories.trajectory_table import GEODETIC, GRID, LOCAL, SIGMAS, position_of
 from roadscan.ingest.reading.columns import UNITS, ColumnOption, Found, Quantity, find_columns, fits, word_of
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.gnss import QUALITIES, UNKNOWN_QUALITY, GnssReader, RawSolutions, StatedQuality

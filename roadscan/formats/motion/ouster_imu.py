@@ -14,7 +14,7 @@ from pydantic import Field
 
 from roadscan.compute.array_types import Float64
 from roadscan.core.errors import FormatError, Missing
-from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2
+from roadscan.core.rig import STANDARD_GRAVITY_M_PER_S2
 from roadscan.core.strict import Strict
 from roadscan.formats.lidars.ouster_metadata import IMU_SAMPLES, LEGACY, OusterMetadata
 from roadscan.formats.lidars.ouster_packets import joined, sensor_clock, serials

@@ -14,7 +14,7 @@ import pyarrow as pa
 
 from roadscan.core.crs import geographic_of, world_frame_of
 from roadscan.core.errors import ConfigError, CrsError, FormatError, Missing, RoadscanError
-from roadscan.core.settings.ppk import PpkBase, PpkSettings
+from roadscan.core.settings.navigation import PpkBase, PpkSettings
 from roadscan.formats.motion.nmea import Nmea
 from roadscan.formats.motion.ppk_checks import (
     Separation,
@@ -26,7 +26,6 @@ from roadscan.formats.motion.ppk_checks import (
     fixed_share,
     joined,
 )
-from roadscan.formats.motion.rinex import observed_epochs, rinex_header, rinex_kind
 from roadscan.formats.motion.rtklib_pos import RtklibPos, RtklibPosOptions
 from roadscan.formats.motion.rtklib_programs import (
     ANTENNAS,
@@ -35,7 +34,10 @@ from roadscan.formats.motion.rtklib_programs import (
     Workplace,
     is_ubx,
     need_program,
+    observed_epochs,
     programs_digest,
+    rinex_header,
+    rinex_kind,
 )
 from roadscan.formats.motion.ubx import Ubx
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows, beside

@@ -14,9 +14,9 @@ from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.crs import crs_from_text, world_frame_of, world_from_geodetic
 from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
-from roadscan.core.settings.ppk import PpkBase, PpkSettings
+from roadscan.core.settings.navigation import PpkBase, PpkSettings
 from roadscan.core.witness import Finding, Witness
-from roadscan.formats.motion.rinex import RinexHeader
+from roadscan.formats.motion.rtklib_programs import RinexHeader
 from roadscan.ingest.reading.gnss import ned_from_ecef
 
 BASE_REFUSED_M: Final = 20.0

@@ -12,8 +12,7 @@ import numpy as np
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.strict import Strict
 from roadscan.core.witness import Finding, Witness
-from roadscan.formats.ros.bag import Bag, Topic
-from roadscan.formats.ros.definitions import Decode
+from roadscan.formats.ros.bag import Bag, Decode, Topic
 from roadscan.formats.ros.return_rows import ReturnRows
 from roadscan.formats.ros.topics import Timed, TopicFormat, TopicOptions
 from roadscan.ingest.reading.format import Item, LogHeader, LogSource

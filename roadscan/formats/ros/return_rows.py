@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from roadscan.core.errors import Missing, TimeSystemError
 from roadscan.core.gpstime import NS_PER_S, SCALES, TAI_MINUS_GPS_S, UNIT_NS, ahead_of_utc_s
-from roadscan.formats.lidars.returns_batch import returns_batch
+from roadscan.formats.lidars.packet_returns import returns_batch
 from roadscan.formats.ros.bag import Message
 from roadscan.formats.ros.topics import message_clock
 from roadscan.ingest.reading.format import Item, LogSource, Rows

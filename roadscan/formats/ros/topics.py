@@ -25,8 +25,7 @@ from roadscan.core.gpstime import NS_PER_S, SCALES, Clock, TimeSystem, ahead_of_
 from roadscan.core.strict import Strict
 from roadscan.core.witness import Finding, Witness
 from roadscan.formats.lidars.pcap import Datagram
-from roadscan.formats.ros.bag import METADATA, Bag, Message, Topic, bag_files, is_bag, packets, stamp_ns
-from roadscan.formats.ros.definitions import Decode
+from roadscan.formats.ros.bag import METADATA, Bag, Decode, Message, Topic, bag_files, is_bag, packets, stamp_ns
 from roadscan.formats.ros.overview import Reader, contents
 from roadscan.ingest.reading.format import Contents, Item, LogFormat, LogHeader, LogSource, Reject, log_formats
 from roadscan.ingest.reading.records import options_of

@@ -4,35 +4,130 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import ClassVar, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.crs import LOCAL_WORLD, crs_from_text
 from roadscan.core.errors import ConfigError, CrsError, FormatError
 from roadscan.core.strict import Strict
-from roadscan.formats.trajectories.level_poses import (
-    ATTITUDE,
-    GEODETIC,
-    GRID,
-    LOCAL,
-    Records,
-    level_poses,
-    pose_quantities,
-)
 from roadscan.ingest.reading.column_table import ColumnTable, Lost, is_number, need_table, open_table
-from roadscan.ingest.reading.columns import ColumnOption, Found, find_columns, fits
+from roadscan.ingest.reading.columns import ColumnOption, Found, Quantity, find_columns, fits
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
-from roadscan.ingest.reading.poses import North, Placement, PoseReader, level_placement
+from roadscan.ingest.reading.poses import (
+    North,
+    Placement,
+    PoseReader,
+    RawPoses,
+    check_rph,
+    level_placement,
+    ned_from_rph,
+)
 from roadscan.ingest.reading.records import Sieve, options_of
-from roadscan.ingest.reading.stamps import TIME
-from roadscan.ingest.reading.table_stamps import EPOCH, TableStamps, need_type
+from roadscan.ingest.reading.stamps import EPOCH, TIME, StampColumn, TableStamps, need_type
+from roadscan.ingest.reading.text_table import Kind, TextLayout, TextOptions, sniff_layout, text_blocks, text_layout
 from roadscan.store.damage import UNREADABLE
+
+GEODETIC: Final = (
+    Quantity("longitude", "angle", ("lon", "lng")),
+    Quantity("latitude", "angle", ("lat",)),
+    Quantity("height", "length", ("altitude", "alt", "elevation", "h-ell", "ellipsoidal_height")),
+)
+GRID: Final = (
+    Quantity("easting", "length"),
+    Quantity("northing", "length"),
+    Quantity("height", "length", ("altitude", "alt", "elevation", "h-ell", "ellipsoidal_height")),
+)
+LOCAL: Final = (
+    Quantity("easting", "length", ("x",)),
+    Quantity("northing", "length", ("y",)),
+    Quantity("height", "length", ("z", "altitude", "alt")),
+)
+ATTITUDE: Final = (Quantity("roll", "angle"), Quantity("pitch", "angle"), Quantity("heading", "angle"))
+SIGMAS: Final = (
+    Quantity("sigma_north", "length", ("sigma_northing",), optional=True),
+    Quantity("sigma_east", "length", ("sigma_easting",), optional=True),
+    Quantity("sigma_down", "length", ("sigma_height", "sigma_up"), optional=True),
+)
+ANGLE_SIGMAS: Final = tuple(Quantity(f"sigma_{q.name}", "angle", optional=True) for q in ATTITUDE)
+
+
+VELOCITIES: Final = (
+    Quantity("velocity_north", "speed", ("vn", "v_north"), optional=True),
+    Quantity("velocity_east", "speed", ("ve", "v_east"), optional=True),
+    Quantity("velocity_down", "speed", ("vd", "v_down"), optional=True),
+    Quantity("velocity_up", "speed", ("vu", "v_up"), optional=True),
+)
+
+
+def position_of(crs: str) -> tuple[Quantity, ...]:
+    """Return the three quantities of a position in a CRS, two horizontal ones first."""
+    if crs == LOCAL_WORLD:
+        return LOCAL
+    return GRID if crs_from_text(crs).is_projected else GEODETIC
+
+
+def pose_quantities(crs: str) -> tuple[Quantity, ...]:
+    """Return all quantities of a pose in a CRS except its time: position, attitude, their σ, and velocity."""
+    return (*position_of(crs), *ATTITUDE, *SIGMAS, *ANGLE_SIGMAS, *VELOCITIES)
+
+
+@dataclass(frozen=True)
+class Records:
+    """Places of a block's records in their log."""
+
+    numbers: Int64
+    """(n,) record numbers."""
+    offsets: Int64
+    """(n,) byte offsets, −1 where there are none."""
+    stamps: npt.NDArray[np.generic]
+    """(n,) time stamps."""
+
+
+def level_poses(
+    records: Records, crs: str, columns: Mapping[str, Found], number: Callable[[str], Float64], sieve: Sieve
+) -> RawPoses:
+    """Return the poses of a block; a record with an impossible attitude is dropped from `sieve`.
+
+    Parameters
+    ----------
+    columns : column of each quantity that the log has, by quantity.
+    number : gives the values (n,) of a column, NaN where one is missing.
+    """
+
+    def quantity(name: str) -> Float64:
+        found = columns[name]
+        with np.errstate(over="ignore"):
+            return number(found.column) * found.scale
+
+    def velocity() -> Float64 | None:
+        north, east, down, up = (quantity(q.name) if q.name in columns else None for q in VELOCITIES)
+        down = -up if down is None and up is not None else down
+        if north is None or east is None:
+            return None
+        return np.stack([north, east, np.full_like(north, np.nan) if down is None else down])
+
+    roll, pitch, heading = (quantity(q.name) for q in ATTITUDE)
+    check_rph(roll, pitch, heading, sieve)
+    with np.errstate(invalid="ignore"):  # infinities of damaged records, dropped above
+        attitude = ned_from_rph(roll, pitch, heading)
+    return RawPoses(
+        records=records.numbers,
+        offsets=records.offsets,
+        stamps=records.stamps,
+        position=np.stack([quantity(q.name) for q in position_of(crs)]),
+        attitude=attitude,
+        sigmas={f"{q.name}_m": quantity(q.name) for q in SIGMAS if q.name in columns}
+        | {f"{q.name}_deg": np.degrees(quantity(q.name)) for q in ANGLE_SIGMAS if q.name in columns},
+        velocity=velocity(),
+    )
+
 
 FRAME_KEY: Final = "roadscan.trajectory"
 """Key of the schema metadata with the frame of the poses as JSON."""
@@ -196,3 +291,90 @@ def _heading(stated: North | None, own: TrajectoryFrame, file: Path) -> North | 
             f'options.heading = "{stated}", the file says "{own.heading}"', expected="one north", file=file
         )
     return stated or own.heading
+
+
+class TrajectoryCsvOptions(TextOptions):
+    """Settings of `trajectory_csv`."""
+
+    columns: dict[str, ColumnOption] = {}
+    """Which column holds which quantity, where its name does not say so: time; longitude, latitude,
+    height, or easting, northing, height; roll, pitch, heading; sigma_north, sigma_east, sigma_down;
+    sigma_roll, sigma_pitch, sigma_heading; velocity_north, velocity_east, velocity_down or velocity_up.
+    For example { latitude = { name = "Lat", unit = "deg" } }."""
+    heading: North | None = None
+    """North that the heading is counted from, clockwise: "true" or "grid". Needed for a projected CRS;
+    a geographic CRS has only true north, a local frame only its y axis ("grid")."""
+
+
+@dataclass(frozen=True)
+class _TrajectoryCsvPlan:
+    """How a file is read."""
+
+    layout: TextLayout
+    columns: dict[str, Found]
+    crs: str
+    kinds: dict[str, Kind]
+    stamps: StampColumn
+    placement: Placement
+
+
+class TrajectoryCsv(LogFormat):
+    """A line a pose: time, position, roll, pitch, heading, in columns whose names carry their units.
+
+    Columns such as ``time_s``, ``latitude_deg``, ``longitude_deg``, ``height_m`` (or ``easting_m``,
+    ``northing_m``), ``roll_deg``, ``pitch_deg``, ``heading_deg`` are found by themselves, any others
+    through `columns`. Time is a number in the stated clock's unit, or ISO 8601 text. Roll is
+    positive with the right side down, pitch with the nose up, heading clockwise from north. Exports
+    of a vendor's program with a preamble and blanks between the columns are read with `skip_lines`,
+    ``delimiter = " "`` and `columns`.
+    """
+
+    name = "trajectory_csv"
+    title = "Trajectory as CSV: time, position, roll, pitch and heading in named columns with units"
+    yields = ("trajectory",)
+    column_sets: ClassVar[tuple[tuple[Quantity, ...], ...]] = tuple(
+        (TIME, *position, *ATTITUDE) for position in (GEODETIC, GRID, LOCAL)
+    )
+    time = (
+        "numbers: state clock.system and clock.unit; ISO 8601 text with a zone (…Z) is UTC, "
+        "without one state unix_utc, unix_gps or unix_tai, the scale it is written in"
+    )
+    options = TrajectoryCsvOptions
+
+    def sniff(self, path: Path) -> bool:
+        """True if all columns of a trajectory are there with units in their names."""
+        layout = sniff_layout(path)
+        return layout is not None and any(
+            fits((TIME, *position, *ATTITUDE), layout.names, (TIME.name,)) for position in (GEODETIC, GRID, LOCAL)
+        )
+
+    def header(self, source: LogSource) -> LogHeader:
+        """Find the columns and check clock, CRS and heading."""
+        plan = _trajectory_csv_plan(source)
+        columns = {quantity: found.column for quantity, found in plan.columns.items()}
+        return LogHeader({"world_frame": plan.placement.world, "columns": columns})
+
+    def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
+        """Stream poses; a line that cannot be read is rejected."""
+        plan = _trajectory_csv_plan(source)
+        reader = PoseReader(source, plan.stamps.clock, plan.placement)
+        for block in text_blocks(source.path, plan.layout, plan.kinds):
+            if isinstance(block, Reject):
+                yield block
+                continue
+            sieve = Sieve(block.records.size)
+            records = Records(block.records, block.offsets, plan.stamps.stamps(block, sieve))
+            yield from reader.items(level_poses(records, plan.crs, plan.columns, block.number, sieve), sieve)
+
+
+def _trajectory_csv_plan(source: LogSource) -> _TrajectoryCsvPlan:
+    options = options_of(source, TrajectoryCsvOptions)
+    placement = level_placement(source, options.heading)
+    crs = source.need_crs()
+    layout = text_layout(source.path, options)
+    plain = {TIME.name: 1.0}  # the clock states its unit, or it is text
+    columns = find_columns((TIME, *pose_quantities(crs)), layout.names, options.columns, source.path, plain)
+    stamps = StampColumn.of(source, source.path, layout, columns["time"])
+    kinds: dict[str, Kind] = {found.column: "number" for found in columns.values()}
+    kinds |= stamps.kinds
+    return _TrajectoryCsvPlan(layout, columns, crs, kinds, stamps, placement)

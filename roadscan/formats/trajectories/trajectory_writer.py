@@ -28,13 +28,18 @@ from roadscan.core.frames import (
     rotation_from_quaternion,
     rph_from_rotation,
 )
-from roadscan.formats.trajectories.level_poses import ANGLE_SIGMAS, ATTITUDE, SIGMAS, position_of
-from roadscan.formats.trajectories.trajectory_table import BATCH_ROWS, FRAME_KEY
+from roadscan.formats.trajectories.trajectory_table import (
+    ANGLE_SIGMAS,
+    ATTITUDE,
+    BATCH_ROWS,
+    FRAME_KEY,
+    SIGMAS,
+    position_of,
+)
 from roadscan.ingest.array_files import ClockLike, WrittenLog, epochs_gps_ns, float_array, parquet_file
 from roadscan.ingest.reading.columns import ColumnOption, Found, Quantity, find_columns
 from roadscan.ingest.reading.poses import ANGLE_MAX_RAD, North
-from roadscan.ingest.reading.stamps import TIME
-from roadscan.ingest.reading.table_stamps import EPOCH
+from roadscan.ingest.reading.stamps import EPOCH, TIME
 
 ECEF: Final = tuple(Quantity(a, "length", (f"ecef_{a}", f"{a}_ecef")) for a in "xyz")
 QUATERNION: Final = tuple(Quantity(f"q{a}", "count") for a in "wxyz")

@@ -11,12 +11,14 @@ from typing import ClassVar, Final, Literal
 
 import numpy as np
 import pyproj
+from pydantic import Field
 from pyproj.exceptions import CRSError as ProjCrsError
 
 from roadscan.core.crs import crs_from_text
 from roadscan.core.errors import ConfigError, CrsError, FormatError, Missing
 from roadscan.core.strict import Strict
 from roadscan.formats.vectors.control import ControlFrame, ControlReader, RawControl, Role, need_role
+from roadscan.formats.vectors.picture_points import BY_HAND, RawPoints, point_items
 from roadscan.ingest.reading.columns import UNITS
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.records import options_of
@@ -233,3 +235,49 @@ def _frame(source: LogSource) -> ControlFrame:
         )
     need_role(False, options_of(source, OdmGcpOptions).role, source.path)
     return ControlFrame.of(replace(source, crs=crs))
+
+
+class OdmPointsOptions(Strict):
+    """Settings of `odm_picture_points`."""
+
+    sigma_px: float | None = Field(default=None, gt=0.0)
+    """1 σ of each coordinate of all points (pixels); not stated where left out."""
+
+
+class OdmPoints(LogFormat):
+    """Where the points of OpenDroneMap's list are in pictures: the columns of x and y in the picture of each line.
+
+    Pixels count from the centre of the upper left one, as OpenSfM, which reads these lists, counts them. Points are
+    named as `odm_gcp` names them, which reads their positions from the same file; so this format has to be stated. A
+    point whose height is NaN is read: it needs none.
+    """
+
+    name = "odm_picture_points"
+    title = "OpenDroneMap's places of control points in pictures (gcp_list.txt)"
+    yields = ("picture_points",)
+    time = "holds no time"
+    options = OdmPointsOptions
+
+    def sniff(self, path: Path) -> bool:
+        """Never: the same file is `odm_gcp`, and the survey file says which part of it is meant."""
+        return False
+
+    def header(self, source: LogSource) -> LogHeader:
+        """Check that it is such a list."""
+        source.need_file()
+        OdmGcp.need_list(source.path)
+        return LogHeader({})
+
+    def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
+        """Stream measurements; a line that is none is rejected."""
+        sigma = options_of(source, OdmPointsOptions).sigma_px
+        for row in odm_rows(source.path):
+            if isinstance(row, Reject):
+                yield row
+                continue
+            yield from point_items(
+                RawPoints(
+                    np.array([row.record]), np.array([row.offset]), [None], [None], [row.picture], [row.point],
+                    np.array([[row.u_px], [row.v_px]]), np.array([np.nan if sigma is None else sigma]), [BY_HAND],
+                )
+            )  # fmt: skip

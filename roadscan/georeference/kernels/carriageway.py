@@ -1,6 +1,6 @@
 """Finds the carriageway in a profile: the surface, connected without a step, with the most readings.
 
-Step 4 of :mod:`roadscan.georeference.segmentation`.
+Step 4 of :mod:`roadscan.georeference.road_profiles`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ SETTINGS = (
     "bin", "share", "gate", "scatter_factor", "scatter_readings", "grazing", "chord", "step", "noise_factor", "slope",
     "window", "window_readings", "bridge",
 )  # fmt: skip
-"""Order of the `settings` tuple; lengths in metres, angles in radians (``georeference.segmentation``)."""
+"""Order of the `settings` tuple; lengths in metres, angles in radians (``georeference.road_profiles``)."""
 (
     BIN, SHARE, GATE, SCATTER_FACTOR, SCATTER_READINGS, GRAZING, CHORD, STEP, NOISE_FACTOR, SLOPE,
     WINDOW, WINDOW_READINGS, BRIDGE,

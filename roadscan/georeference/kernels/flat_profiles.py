@@ -1,7 +1,7 @@
 """Georeferences profiles whose readings are taken at one instant near the sensor.
 
 All readings of such a profile have one pose and lie in one plane, a few metres across. There the map is linear to a
-few µm (``georeference.flat_profiles`` limits the reach accordingly), so each map coordinate is
+few µm (``georeference.charts`` limits the reach accordingly), so each map coordinate is
 
     value = anchor + p + q · y + r · z
 
@@ -18,7 +18,6 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.kernel_options import bare, bare_inlined, inlined, kernel
-from roadscan.georeference.kernels.charts import box_of, chart_index, expansion, map_value
 from roadscan.georeference.kernels.readings import (
     CLASS_NO_POSE,
     CLASS_NO_RETURN,
@@ -32,7 +31,11 @@ from roadscan.georeference.kernels.readings import (
     NO_RETURN,
     OUTSIDE,
     RANGE,
+    box_of,
+    chart_index,
+    expansion,
     is_wanted,
+    map_value,
     tile_and_rest,
     write_point,
 )

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.kernel_options import inlined, inner, kernel
-from roadscan.georeference.kernels.charts import box_of, chart_index, expansion, map_value
+from roadscan.georeference.kernels.readings import box_of, chart_index, expansion, map_value
 from roadscan.georeference.kernels.tile_set import add_tile, mark_zonotope, take, tile_set
 from roadscan.poses.kernels.poses import attitude_at, find_interval, interval, position_at
 

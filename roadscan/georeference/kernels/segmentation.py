@@ -1,6 +1,6 @@
 """Finds the readings of a profile that hit the road: histogram threshold, height, second derivative, angle, connection.
 
-The steps and how each is read are described in :mod:`roadscan.georeference.segmentation`. All of it happens in the
+The steps and how each is read are described in :mod:`roadscan.georeference.road_profiles`. All of it happens in the
 plane of the profile, in the sensor's axes: y across, *up* = −z.
 """
 

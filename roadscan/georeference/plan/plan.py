@@ -3,38 +3,131 @@
 from __future__ import annotations
 
 import datetime as dt
+import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
-from typing import TypeAlias
+from typing import Self, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
-from roadscan.core.errors import ConfigError, RunError
-from roadscan.core.gpstime import iso_from_gps_ns, utc_from_gps_ns
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import LanePass, RunId, of_run
+from roadscan.compute.array_types import Int64
+from roadscan.core.errors import ConfigError, NavigationError, RunError
+from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns, utc_from_gps_ns
+from roadscan.core.grid import LanePass, RunId, TileGrid, of_run
 from roadscan.core.rig import UNMOUNTED, Mounting, Mountings, Rig, Sensor
 from roadscan.core.survey import Survey
 from roadscan.georeference.place import HeightLimits
 from roadscan.georeference.plan.centre_line import CentreLines
-from roadscan.georeference.plan.corrections import KnownCorrections
 from roadscan.georeference.plan.road import check_road, road_of
-from roadscan.georeference.sources import MapSettings, RawSlice, ReadingSource, change_of, load_mountings
+from roadscan.georeference.road_profiles import TICK_NS, WINDOW_NS
+from roadscan.georeference.sources import (
+    MapSettings,
+    MountingChanges,
+    RawSlice,
+    ReadingSource,
+    change_of,
+    load_mounting_changes,
+    load_mountings,
+)
+from roadscan.ingest.epoch_order import one_stamp_logs
 from roadscan.ingest.ingest import DATA_TABLES
-from roadscan.ingest.one_stamp import one_stamp_logs
 from roadscan.ingest.overlap import Fault, NothingPlacedError, apart_logs
 from roadscan.ingest.reading.format import known_format
-from roadscan.ingest.same_content import same_points
+from roadscan.ingest.sources import same_points
 from roadscan.navigation.tasks.clocks import load_clocks
 from roadscan.navigation.tasks.navigate import records_of, records_with_trajectories
-from roadscan.navigation.tasks.trajectories import TrajectorySource
+from roadscan.navigation.tasks.trajectories import TrajectorySource, load_all_corrections
+from roadscan.poses.movement import Allowance, allowance_for, largest
+from roadscan.poses.trajectory import STENCIL_KNOTS, Corrections
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import grid_key, key_of
 from roadscan.run.session import Session, found_once
 from roadscan.store.logs import NAVIGATION, DataFile, LogRecord
 from roadscan.store.store import Store
+
+UInt64 = npt.NDArray[np.uint64]
+
+
+@dataclass(frozen=True)
+class KnownCorrections:
+    """Corrections of all runs and of the mountings of all sensors, as stored in the tables."""
+
+    by_run: Mapping[str, Corrections]
+    mountings: MountingChanges = field(default_factory=dict)
+
+    @classmethod
+    def load(cls, store: Store) -> Self:
+        """Read the tables. Damage is reported here, before tiles depend on it."""
+        return cls(load_all_corrections(store), load_mounting_changes(store))
+
+    def allowance(self, run: str, sensor: str) -> Allowance:
+        """Return the allowance for corrections in bounds on a run's recorded poses and a sensor's stated mounting.
+
+        Raises
+        ------
+        NavigationError
+            where its corrections are no corrections.
+        """
+        own = self.by_run.get(run)
+        try:
+            change = change_of(self.mountings, run, sensor)
+            return allowance_for(own, (0.0, 0.0) if change is None else change.largest)
+        except ValueError:
+            shift, turn = largest(own)
+            raise NavigationError(
+                f"the corrections of run '{run}' are as large as {shift:,.3g} m and {turn:.3g} rad",
+                expected="corrections of recorded poses: metres and radians, small ones",
+                change="remove the table `corrections`, or put a right one in its place",
+            ) from None
+
+    def digests(self, source: ReadingSource, spans_gps_ns: Int64, max_gap_s: float) -> UInt64:
+        """Return a digest (n,) of the corrections that affect readings of spans (n, 2) of time; 0 where there are none.
+
+        It combines that of the mounting and the sum of the digests of the knots in each span, and beyond it as far as
+        interpolation uses them.
+        """
+        own = self.by_run.get(source.run)
+        mounted = np.uint64(0) if source.trajectory is None else self._mounting_digest(source.run, source.sensor)
+        if own is None or source.trajectory is None:
+            return np.full(len(spans_gps_ns), mounted, np.uint64)
+        wide = beyond_ns(source, max_gap_s)
+        knots, sums = own.epochs_gps_ns, self._sums[source.run]
+        first = np.searchsorted(knots, spans_gps_ns[:, 0] - wide, side="right") - 1
+        last = np.searchsorted(knots, spans_gps_ns[:, 1] + wide, side="left")
+        found: UInt64 = sums[np.minimum(last, knots.size - 1) + 1] - sums[np.maximum(first, 0)]
+        return found + mounted
+
+    def _mounting_digest(self, run: str, sensor: str) -> np.uint64:
+        change = change_of(self.mountings, run, sensor)
+        if change is None:
+            return np.uint64(0)
+        return np.uint64(int.from_bytes(hashlib.blake2b(change.values.tobytes(), digest_size=8).digest(), "little"))
+
+    @cached_property
+    def _sums(self) -> dict[str, UInt64]:
+        """Return for each run the sums (k + 1,) of the digests of the knots before each, modulo 2⁶⁴."""
+        return {run: np.append(np.uint64(0), np.cumsum(_digests(own))) for run, own in self.by_run.items()}
+
+
+def beyond_ns(source: ReadingSource, max_gap_s: float) -> int:
+    """Return how far beyond their epochs (ns) poses affect the readings of a source."""
+    geometry = source.attribute.get("scan_geometry") or {}
+    profile_s = float(geometry.get("reading_period_ns", 0.0)) * int(geometry.get("readings", 1)) / NS_PER_S
+    turns = WINDOW_NS + TICK_NS if source.road is not None and source.road.turns is not None else 0
+    return round((STENCIL_KNOTS * max_gap_s + profile_s) * NS_PER_S) + turns
+
+
+def _digests(corrections: Corrections) -> UInt64:
+    """Return a digest (k,) of each knot: its epoch and its six values."""
+    columns = [corrections.epochs_gps_ns, *corrections.north_east_down_m.T, *corrections.roll_pitch_heading_rad.T]
+    rows = np.column_stack([np.ascontiguousarray(column).view(np.uint64) for column in columns])
+    found = b"".join(hashlib.blake2b(row.tobytes(), digest_size=8).digest() for row in rows)
+    return np.frombuffer(found, np.uint64)
+
 
 DatedMountings: TypeAlias = Mapping[tuple[str, str], Sequence[tuple[int, Mounting]]]
 """Calibrated mountings by run ('*' for all) and sensor, with the epochs from which they apply, ascending."""

@@ -17,14 +17,13 @@ from typing import Final
 
 from roadscan.core.errors import FormatError, Missing, RoadscanError
 from roadscan.core.toml_text import toml
-from roadscan.ingest.inspect.file_kinds import UNPACKING_ERRORS, head_of, is_cut_off, kind_of, wrapper_of
-from roadscan.ingest.inspect.known_files import known_file
+from roadscan.ingest.inspect.file_kinds import UNPACKING_ERRORS, head_of, is_cut_off, kind_of, known_file, wrapper_of
 from roadscan.ingest.inspect.log_figures import LogFigures
 from roadscan.ingest.inspect.provisional import OpenedLog, Stated, open_log
 from roadscan.ingest.reading.columns import Likeness, likeness
 from roadscan.ingest.reading.format import LogFormat, log_formats
+from roadscan.ingest.reading.text_files import open_unpacked
 from roadscan.ingest.reading.text_table import TextOptions, first_words, text_layout
-from roadscan.ingest.reading.unpacked import open_unpacked
 
 UNPACKED_BYTES: Final = 16 << 20
 """Bytes of a compressed file that are unpacked to look inside."""

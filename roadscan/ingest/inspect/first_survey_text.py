@@ -31,7 +31,7 @@ from roadscan.ingest.inspect.inspect import LogReport
 from roadscan.ingest.inspect.log_figures import Extent
 from roadscan.ingest.inspect.provisional import Need
 from roadscan.ingest.reading.format import LogFormat, Part
-from roadscan.store.codecs.picture_tags import tags_in_words
+from roadscan.store.codecs.image_files import tags_in_words
 
 RIG_NAME: Final = "RIG.toml"
 _WIDTH: Final = 110  # characters of a comment line

@@ -27,7 +27,7 @@ from roadscan.ingest.inspect.file_kinds import FileKind, is_cut_off, kind_of, wr
 from roadscan.ingest.inspect.log_figures import Fault, LogFigures, TableFigures
 from roadscan.ingest.inspect.provisional import OpenedLog, Stated, raw_stamps_ns
 from roadscan.ingest.reading.format import Contents, Item, LogFormat, Rows, format_alone, log_formats
-from roadscan.ingest.reading.future_times import FutureTimes
+from roadscan.ingest.reading.stamps import FutureTimes
 
 QUICK_VALUES: Final = 1_000_000
 """Readings after which a quick inspection stops."""

@@ -22,7 +22,7 @@ from roadscan.core.errors import RoadscanError, SchemaError
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.witness import Finding
 from roadscan.ingest.reading.format import Item, LogHeader, Reject, Rows
-from roadscan.ingest.reading.future_times import FutureTimes
+from roadscan.ingest.reading.stamps import FutureTimes
 from roadscan.poses.leaps import FASTEST_M_PER_S
 from roadscan.store.readings.returns import distances_m
 from roadscan.store.schema import TableSchema, table_schema

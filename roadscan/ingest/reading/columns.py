@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from roadscan.core.errors import ConfigError, FormatError, Missing, TimeSystemError, nearest
 from roadscan.core.gpstime import UNIT_NS, Clock
-from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2
+from roadscan.core.rig import STANDARD_GRAVITY_M_PER_S2
 from roadscan.core.strict import Strict
 
 Dimension: TypeAlias = Literal[

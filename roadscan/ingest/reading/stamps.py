@@ -6,9 +6,11 @@ written. Both are counted in nanoseconds from 1970 on that scale, and the clock 
 
 from __future__ import annotations
 
+import datetime as dt
 import re
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final, Self
 
@@ -18,11 +20,25 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from roadscan.compute.array_types import Float64, Int64
-from roadscan.core.errors import FormatError, Missing, TimeSystemError
-from roadscan.core.gpstime import NS_PER_S, UNIT_NS, WEEKS_A_ROLLOVER, Clock, TimeSystem, leap_seconds_at_unix
+from roadscan.core.errors import ConfigError, FormatError, Missing, TimeSystemError
+from roadscan.core.gpstime import (
+    ADJUSTED_OFFSET_S,
+    EARLIEST_GPS_NS,
+    GPS_EPOCH_UNIX_S,
+    LATEST_GPS_NS,
+    NS_PER_S,
+    UNIT_NS,
+    WEEKS_A_ROLLOVER,
+    Clock,
+    TimeSystem,
+    gps_ns_from_utc,
+    iso_from_gps_ns,
+    leap_seconds_at_unix,
+)
 from roadscan.core.witness import Witness
+from roadscan.ingest.reading.column_table import is_number as table_is_number
 from roadscan.ingest.reading.columns import Found, Quantity, need_stamp_unit
-from roadscan.ingest.reading.format import LogSource
+from roadscan.ingest.reading.format import LogHeader, LogSource, Rows
 from roadscan.ingest.reading.records import Sieve
 from roadscan.ingest.reading.text_table import Kind, TextBlock, TextLayout, first_fields, is_number, stamp_kind
 
@@ -274,3 +290,149 @@ def parse_calendar(words: Sequence[str], *, zoned: bool) -> Int64 | None:
         return np.asarray(pc.cast(text, kind).cast(pa.int64()), dtype=np.int64)
     except pa.ArrowInvalid:
         return None
+
+
+EPOCH: Final = "epoch_gps_ns"
+"""Column of GPS time (int64, ns since 1980-01-06): such a table needs no clock."""
+
+
+@dataclass(frozen=True)
+class TableStamps:
+    """The column of a table with the log's stamps."""
+
+    column: str
+    clock: Clock
+    """Clock of the numbers that :meth:`stamps` returns."""
+
+    @classmethod
+    def of(cls, source: LogSource, schema: pa.Schema, time: Found | None) -> Self:
+        """Find how the stamps are written, and check the stated clock against that.
+
+        Parameters
+        ----------
+        time : the column of stamps in the log's clock; None for a table with the column `epoch_gps_ns`.
+
+        Raises
+        ------
+        ConfigError, FormatError, TimeSystemError
+            if a clock is stated that is not needed, the column holds no stamps, or the clock is missing or another.
+        """
+        if time is None:
+            refuse_clock(source)
+            need_type(schema, EPOCH, pa.types.is_int64(schema.field(EPOCH).type), "int64", source)
+            return cls(EPOCH, Clock(TimeSystem.GPS, unit="ns"))
+        kind = schema.field(time.column).type
+        if pa.types.is_timestamp(kind):
+            shown = "2026-05-04T09:30:00" + ("Z" if kind.tz else "")
+            stated = source.clock if kind.tz else source.any_clock
+            return cls(time.column, calendar_clock(stated, shown, source.path, zoned=bool(kind.tz)))
+        need_type(
+            schema, time.column, table_is_number(kind), "numbers in the unit of the log's clock, or timestamps", source
+        )
+        clock = source.need_clock("gps", unit="s")
+        need_stamp_unit(time, clock, source.path)
+        return cls(time.column, clock)
+
+    def stamps(self, batch: pa.RecordBatch, sieve: Sieve) -> npt.NDArray[np.generic]:
+        """Return stamps (n,) of a batch, float64 or int64, in `clock`'s unit; missing ones are dropped from `sieve`."""
+        return column_stamps(batch.column(self.column), sieve, is_epoch=self.column == EPOCH)
+
+
+def column_stamps(stamps: pa.Array, sieve: Sieve, *, is_epoch: bool) -> npt.NDArray[np.generic]:
+    """Return values (n,) of a column of stamps, 0 where missing; GPS epochs outside 1980–2080 are dropped."""
+    sieve.drop(np.asarray(stamps.is_null()), "the time stamp is missing")
+    if pa.types.is_timestamp(stamps.type):
+        stamps = stamps.cast(pa.timestamp("ns", stamps.type.tz), safe=False).cast(pa.int64())
+    values = np.asarray(stamps.fill_null(0).to_numpy(zero_copy_only=False))
+    if values.dtype.kind in "iu":
+        values = values.astype(np.int64, copy=False)
+    if is_epoch:
+        sieve.drop((values < EARLIEST_GPS_NS) | (values > LATEST_GPS_NS), f"{EPOCH} is outside 1980–2080")
+    return values
+
+
+def refuse_clock(source: LogSource) -> None:
+    """Raise :class:`ConfigError` where a clock is stated for a table of GPS epochs."""
+    if source.clock is not None:
+        raise ConfigError(
+            f"a clock is stated, and the column '{EPOCH}' is GPS time already",
+            expected="no clock, or the stamps in a column 'time'",
+            file=source.path,
+        )
+
+
+def need_type(schema: pa.Schema, column: str, fits: bool, expected: str, source: LogSource) -> None:
+    """Raise :class:`FormatError` unless a column's type `fits`."""
+    if not fits:
+        raise FormatError(f"column '{column}' is {schema.field(column).type}", expected=expected, file=source.path)
+
+
+TIME_IN_FUTURE: Final = Witness(
+    "time_in_future",
+    input="any log with a stamp a row",
+    fault="The stamps are on another scale than the log or its clock says, such as POSIX seconds under the bit of "
+    "standard GPS time.",
+    asks="the later of the log file's own date and this computer's, and a day",
+    does="rows of a later time are left out; the reason names the scale on which they would not lie in the future",
+    told=("rejects",),
+)
+
+_MARGIN_NS: Final = 86_400 * NS_PER_S
+"""Tolerance (ns): clocks of two computers, or local times taken as UTC, differ by less."""
+_ORIGIN_GPS_S: Final = {
+    TimeSystem.UNIX_UTC: -GPS_EPOCH_UNIX_S,
+    TimeSystem.GPS: 0,
+    TimeSystem.GPS_ADJUSTED: ADJUSTED_OFFSET_S,
+}
+"""GPS seconds at which the count of each scale begins, to within some leap seconds."""
+_EARLIEST_GPS_S: Final = 630_720_000
+"""Start of 2000 (GPS s): there was no mobile mapping before."""
+
+
+@dataclass
+class FutureTimes:
+    """Checks the epochs of one log against today's date."""
+
+    latest_gps_ns: int
+    system: TimeSystem | None
+    """Assumed time system of the stamps, where one is known; a free clock has no date."""
+    _reason: str = field(default="")
+
+    @classmethod
+    def of(cls, source: LogSource, header: LogHeader) -> FutureTimes:
+        """Return the check of a log as the survey file describes it."""
+        written_unix_s = source.path.stat().st_mtime if source.path.exists() else 0.0
+        now = dt.datetime.fromtimestamp(max(time.time(), written_unix_s), dt.UTC)
+        said = header.attributes.get("time_system") or (source.any_clock.system if source.any_clock else None)
+        known = TimeSystem(said) if said in set(TimeSystem) else None
+        return cls(gps_ns_from_utc(now) + _MARGIN_NS, known)
+
+    def refused(self, rows: Rows) -> list[tuple[npt.NDArray[np.int64], str]]:
+        """Return the rows of a chunk (by index) that lie in the future, with the reason."""
+        _, batch = rows.stored
+        if self.system is TimeSystem.FREE or not batch.num_rows or "epoch_gps_ns" not in batch.schema.names:
+            return []
+        column = batch.column("epoch_gps_ns")
+        last = pc.max(column).as_py() if pa.types.is_int64(column.type) else None
+        if last is None or last <= self.latest_gps_ns:
+            return []
+        late = np.flatnonzero(
+            pc.fill_null(pc.greater(column, self.latest_gps_ns), False).to_numpy(zero_copy_only=False)
+        )
+        self._reason = self._reason or self._words(int(column[int(late[0])].as_py()))
+        return [(late, self._reason)]
+
+    def _words(self, epoch_gps_ns: int) -> str:
+        text = f"the time lies in the future ({iso_from_gps_ns(epoch_gps_ns)[:19]}Z"
+        if self.system not in _ORIGIN_GPS_S:
+            return f"{text}): check the log's clock"
+        counted_s = epoch_gps_ns // NS_PER_S - _ORIGIN_GPS_S[self.system]
+        for system, origin_s in _ORIGIN_GPS_S.items():
+            other_s = counted_s + origin_s
+            if system is not self.system and _EARLIEST_GPS_S < other_s <= self.latest_gps_ns // NS_PER_S:
+                there = iso_from_gps_ns(other_s * NS_PER_S)[:10]
+                return (
+                    f"{text} as '{self.system}'): as '{system}' it would be {there}; if it was driven then, state "
+                    f'clock = {{ system = "{system}" }}'
+                )
+        return f"{text} as '{self.system}'): check the log's clock"

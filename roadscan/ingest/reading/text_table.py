@@ -31,8 +31,7 @@ from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.core.strict import Strict
 from roadscan.core.witness import Witness
 from roadscan.ingest.reading.format import Reject
-from roadscan.ingest.reading.later_headers import AGAIN, Headers, NameLines
-from roadscan.ingest.reading.unpacked import is_unpacked, open_unpacked
+from roadscan.ingest.reading.text_files import AGAIN, Headers, NameLines, is_unpacked, open_unpacked
 
 BLOCK_BYTES: Final = 1 << 20  # bytes of a block of text
 LINE_BYTES_MAX: Final = 1 << 16

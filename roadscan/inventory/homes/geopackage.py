@@ -24,13 +24,18 @@ import shapely
 
 from roadscan.core.crs import MapFrame
 from roadscan.inventory.home import CHOICES, FID, Content, Decision, EditFault, Home, HomeError, Mark, Sheet
-from roadscan.inventory.homes.added_tables import OddValue, keep_added, odd_values
-from roadscan.inventory.homes.map_crs import into_map
-from roadscan.inventory.qgis.styles import add_styles
+from roadscan.inventory.homes.added_tables import OddValue, into_map, keep_added, odd_values
+from roadscan.inventory.qgis import add_styles
 from roadscan.inventory.values import iso_wkb
-from roadscan.store.asset_schema import AssetColumn, asset_kind_names, asset_schema
-from roadscan.store.holding.process import process_lives
-from roadscan.store.inventory_schema import GEOMETRY, asset_columns, asset_table
+from roadscan.store.asset_schema import (
+    GEOMETRY,
+    AssetColumn,
+    asset_columns,
+    asset_kind_names,
+    asset_schema,
+    asset_table,
+)
+from roadscan.store.holders import process_lives
 
 MARKS: Final = "roadscan_inventory"
 CONFLICTS: Final = "conflicts"

@@ -25,8 +25,7 @@ from roadscan.inventory.conflicts import Conflict, value_shown
 from roadscan.inventory.edits import Edit
 from roadscan.inventory.home import FID, Author, Content, EditFault, Home, HomeError, Mark, Sheet
 from roadscan.inventory.values import encoded, iso_wkb
-from roadscan.store.asset_schema import asset_schema
-from roadscan.store.inventory_schema import GEOMETRY, asset_table, kinds_by_table
+from roadscan.store.asset_schema import GEOMETRY, asset_schema, asset_table, kinds_by_table
 
 LAYER: Final = "asset_"
 """Prefix of the names of the page's layers; the table of their kind follows."""

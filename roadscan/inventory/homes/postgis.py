@@ -22,10 +22,18 @@ from roadscan.core.crs import MapFrame
 from roadscan.core.errors import ConfigError
 from roadscan.core.extras import needed
 from roadscan.inventory.home import CHOICES, FID, Author, Content, Decision, Home, HomeError, Mark, Sheet
-from roadscan.inventory.homes.map_crs import into_map
+from roadscan.inventory.homes.added_tables import into_map
 from roadscan.inventory.values import iso_wkb
-from roadscan.store.asset_schema import AssetColumn, AssetSchema, asset_kind_names, asset_schema
-from roadscan.store.inventory_schema import GEOMETRY, asset_columns, asset_table, kinds_by_table
+from roadscan.store.asset_schema import (
+    GEOMETRY,
+    AssetColumn,
+    AssetSchema,
+    asset_columns,
+    asset_kind_names,
+    asset_schema,
+    asset_table,
+    kinds_by_table,
+)
 
 MARKS: Final = "roadscan_inventory"
 _WAIT_MS: Final = 10_000  # Wait for a lock on the tables, at most (ms).

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from roadscan.core.canvas import empty_figure
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
-from roadscan.ingest.clocks.correction import ClockCorrection, Residuals
+from roadscan.ingest.clock_correction import ClockCorrection, Residuals
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

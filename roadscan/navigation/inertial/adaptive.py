@@ -35,8 +35,8 @@ from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.compute.robust import scatter_about
 from roadscan.core.errors import NavigationError
 from roadscan.core.frames import rotation_from_quaternion
-from roadscan.core.settings.smoothing import SmootherConfig
-from roadscan.navigation.inertial.earth import ecef_from_level
+from roadscan.core.settings.navigation import SmootherConfig
+from roadscan.navigation.inertial.alignment import ecef_from_level
 from roadscan.navigation.inertial.noise import fixes_of, usable
 from roadscan.navigation.inertial.readings import (
     GnssSolutions,

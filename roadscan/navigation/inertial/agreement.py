@@ -15,7 +15,7 @@ from roadscan.compute.array_types import Bool, Float64
 from roadscan.compute.flags import runs_of
 from roadscan.core.errors import ConfigError, NavigationError, TimeSystemError
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2
+from roadscan.core.rig import STANDARD_GRAVITY_M_PER_S2
 from roadscan.navigation.inertial.motion import STEP_S, Windows, imu_means
 from roadscan.navigation.inertial.readings import ImuReadings, VehicleSensors
 

@@ -6,6 +6,10 @@ solved by singular value decomposition) is the first attitude (optimisation-base
 "Velocity/position integration formula, part I"). Gravity alone levels; accelerations and turns give the
 heading, whichever way the vehicle looks, so that driving backwards is no special case. An IMU whose gyroscopes feel
 the Earth's rate standing needs no motion.
+
+The Earth's level axes, normal gravity and rotation (WGS 84).
+
+WGS 84; other datums differ by far less than an accelerometer resolves.
 """
 
 from __future__ import annotations
@@ -17,10 +21,35 @@ import numpy as np
 
 from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.errors import NavigationError
-from roadscan.navigation.inertial.earth import EARTH_RATE_ECEF_RAD_PER_S, ecef_from_level, gravity_ecef
-from roadscan.navigation.inertial.kernels.strapdown import increments, turned_frame
+from roadscan.navigation.inertial.kernels.strapdown import (
+    EARTH_RATE_RAD_PER_S,
+    geodetic_of,
+    gravity_at,
+    increments,
+    turned_frame,
+)
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, VehicleSensors
 from roadscan.navigation.inertial.timeline import merged
+
+EARTH_RATE_ECEF_RAD_PER_S: Final[Float64] = np.array([0.0, 0.0, EARTH_RATE_RAD_PER_S])  # ECEF axes.
+
+
+def ecef_from_level(position_ecef_m: Float64) -> Float64:
+    """Return rotations (n, 3, 3) from north-east-down to ECEF at positions (n, 3). Groves (2013), eq. 2.150."""
+    found = np.empty((len(position_ecef_m), 5))
+    geodetic_of(np.ascontiguousarray(position_ecef_m), found)
+    sa, ca, so, co, _ = found.T
+    rows = [[-sa * co, -so, -ca * co], [-sa * so, co, -ca * so], [ca, np.zeros_like(ca), -sa]]
+    axes: Float64 = np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+    return axes
+
+
+def gravity_ecef(position_ecef_m: Float64) -> Float64:
+    """Return normal gravity (3,) at a position (3,), ECEF axes (m/s²)."""
+    size, *up = gravity_at(*(float(x) for x in position_ecef_m))
+    gravity: Float64 = -size * np.array(up)
+    return gravity
+
 
 _SPACING_NS: Final = 500_000_000
 """Least interval over which changes of velocity are compared."""

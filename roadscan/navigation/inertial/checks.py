@@ -30,13 +30,14 @@ from roadscan.navigation.inertial.agreement import (
 from roadscan.navigation.inertial.motion import (
     STEP_S,
     Windows,
+    check_frame,
     imu_means,
     odometer_means,
     position_velocity,
     track_of,
     windows_of,
+    without_leaps,
 )
-from roadscan.navigation.inertial.positions import check_frame, without_leaps
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, OdometerReadings, VehicleSensors
 from roadscan.navigation.inertial.records import (
     Kept,

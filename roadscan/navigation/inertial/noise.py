@@ -19,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.array_types import Float64
-from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2
-from roadscan.core.settings.smoothing import SmootherConfig
+from roadscan.core.rig import STANDARD_GRAVITY_M_PER_S2
+from roadscan.core.settings.navigation import SmootherConfig
 from roadscan.navigation.inertial.kernels.kalman_states import Fixes
 from roadscan.navigation.inertial.readings import GnssSolutions, ImuReadings, VehicleSensors
 

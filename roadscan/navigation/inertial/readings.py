@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.array_types import Float64, Int64
-from roadscan.core.imu import ImuErrors
+from roadscan.core.rig import ImuErrors
 
 
 @dataclass(frozen=True)

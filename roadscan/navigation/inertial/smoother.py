@@ -3,7 +3,7 @@
 A loosely coupled error-state Kalman filter (:mod:`roadscan.navigation.inertial.kernels.kalman`) runs forwards over a
 run, a smoother (:mod:`roadscan.navigation.inertial.kernels.kalman_smoother`) back. The order of things is
 :mod:`~roadscan.navigation.inertial.timeline`, the first attitude :mod:`~roadscan.navigation.inertial.alignment`,
-standstill :mod:`~roadscan.navigation.inertial.standing`, the trust in readings
+standstill :mod:`~roadscan.navigation.inertial.timeline`, the trust in readings
 :mod:`~roadscan.navigation.inertial.noise`.
 """
 
@@ -19,10 +19,9 @@ from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.crs import LOCAL_WORLD
 from roadscan.core.errors import NavigationError
 from roadscan.core.frames import quaternion_from_rotation
-from roadscan.core.imu import STANDARD_GRAVITY_M_PER_S2
-from roadscan.core.settings.smoothing import SmootherConfig
-from roadscan.navigation.inertial.alignment import Alignment, align
-from roadscan.navigation.inertial.earth import ecef_from_level
+from roadscan.core.rig import STANDARD_GRAVITY_M_PER_S2
+from roadscan.core.settings.navigation import SmootherConfig
+from roadscan.navigation.inertial.alignment import Alignment, align, ecef_from_level
 from roadscan.navigation.inertial.kernels.kalman import filter_forwards
 from roadscan.navigation.inertial.kernels.kalman_smoother import Poses, smooth_backwards, spread
 from roadscan.navigation.inertial.kernels.kalman_states import (
@@ -44,8 +43,7 @@ from roadscan.navigation.inertial.readings import (
     Solution,
     VehicleSensors,
 )
-from roadscan.navigation.inertial.standing import standing
-from roadscan.navigation.inertial.timeline import Timeline, chosen, timeline
+from roadscan.navigation.inertial.timeline import Timeline, chosen, standing, timeline
 
 KINDS: Final = np.array(
     ["gnss position", "gnss velocity", "odometer", "non-holonomic", "zero velocity", "zero rotation"]

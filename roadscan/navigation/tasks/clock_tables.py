@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from roadscan.core.errors import DamagedError
-from roadscan.ingest.clocks.correction import ClockCorrection, Residuals
+from roadscan.ingest.clock_correction import ClockCorrection, Residuals
 from roadscan.store.small_tables import read_small, small_path, write_small
 from roadscan.store.store import Store
 

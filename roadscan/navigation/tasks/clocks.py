@@ -15,8 +15,8 @@ from roadscan.core.clock_evidence import MotionEvidence
 from roadscan.core.errors import ConfigError, RoadscanError, RunError, nearest
 from roadscan.core.extras import can_draw
 from roadscan.core.survey import LogConfig, Survey
-from roadscan.ingest.clocks.correction import ClockCorrection, Residuals
-from roadscan.ingest.clocks.stated_pairs import log_pairs
+from roadscan.ingest.clock_correction import ClockCorrection, Residuals
+from roadscan.ingest.clock_pairs import log_pairs
 from roadscan.ingest.ingest import survey_records
 from roadscan.ingest.planned_logs import Logs
 from roadscan.navigation.clocks.motion import MotionFit, clock_from_motion

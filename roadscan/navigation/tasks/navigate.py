@@ -18,9 +18,14 @@ from roadscan.core.errors import ConfigError, DamagedError, RoadscanError, RunEr
 from roadscan.core.survey import Survey
 from roadscan.ingest.ingest import ingested_of, survey_records
 from roadscan.ingest.planned_logs import Logs, plan_logs
-from roadscan.navigation.tasks.computed_trajectory import Computed, PlannedTrajectory, sigma_figures, trajectory_rows
 from roadscan.navigation.tasks.odometry_trajectory import plan_odometry
-from roadscan.navigation.tasks.solve_trajectory import plan_solutions
+from roadscan.navigation.tasks.solve_trajectory import (
+    Computed,
+    PlannedTrajectory,
+    plan_solutions,
+    sigma_figures,
+    trajectory_rows,
+)
 from roadscan.poses.trajectory import Trajectory
 from roadscan.run.code_reach import code_digest, name_of
 from roadscan.run.engine.fingerprint import key_of

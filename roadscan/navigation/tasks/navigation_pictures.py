@@ -13,7 +13,7 @@ import pyarrow as pa
 from roadscan.compute.array_types import Float64
 from roadscan.core.extras import can_draw
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.core.ids import of_run
+from roadscan.core.grid import of_run
 from roadscan.core.survey import Survey
 from roadscan.navigation.inertial.motion import ned_from_world
 from roadscan.navigation.inertial.readings import Innovations, Solution

@@ -16,39 +16,35 @@ from roadscan.core.errors import NavigationError
 from roadscan.core.extras import is_installed
 from roadscan.core.frames import quaternion_from_rotation
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
-from roadscan.core.ids import of_run
-from roadscan.core.imu import IMU_GRADES, STANDARD_GRAVITY_M_PER_S2
-from roadscan.core.rig import Sensor
-from roadscan.core.settings.odometry import OdometryConfig
+from roadscan.core.grid import of_run
+from roadscan.core.rig import IMU_GRADES, STANDARD_GRAVITY_M_PER_S2, Sensor
+from roadscan.core.settings.navigation import OdometryConfig
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding, Witness
-from roadscan.ingest.clocks.correction import ClockCorrection
+from roadscan.ingest.clock_correction import ClockCorrection
 from roadscan.navigation.inertial.readings import ImuReadings
-from roadscan.navigation.odometry.registration import (
+from roadscan.navigation.odometry import (
     FEWEST_POINTS,
     LEAST_HELD,
     LIBRARY,
-    Matched,
-    Sweep,
-    match,
-    sweeps_of,
-)
-from roadscan.navigation.odometry.rig_motion import (
     STANDING_SIGMA_DEG,
     WINDOW_S,
+    Matched,
+    Sweep,
     Way,
     Windows,
     levelled,
+    match,
     sigmas,
+    sweeps_of,
     tilt_sigma_rad,
     unbent,
     way_of,
     windows_of,
 )
 from roadscan.navigation.tasks.clock_tables import load_clocks
-from roadscan.navigation.tasks.computed_trajectory import Computed, sigma_figures, trajectory_rows
 from roadscan.navigation.tasks.navigation_logs import chosen, imu_readings, sensor_of
-from roadscan.navigation.tasks.solve_trajectory import on_time
+from roadscan.navigation.tasks.solve_trajectory import Computed, on_time, sigma_figures, trajectory_rows
 from roadscan.run.code_reach import code_digest, name_of
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.logs import NAVIGATION, LogRecord

@@ -19,9 +19,8 @@ from roadscan.georeference.plan.plan import (
     poses_plan_of,
 )
 from roadscan.navigation.tasks.navigate import records_of
-from roadscan.navigation.tasks.taken_pictures import TakenPictures
-from roadscan.pictures.frames.chosen import FOLDER, FRAMES, camera_pictures
-from roadscan.pictures.frames.files import FrameTask, write_frame
+from roadscan.navigation.tasks.recorded_pictures import TakenPictures
+from roadscan.pictures.frames.chosen import FOLDER, FRAMES, FrameTask, camera_pictures, write_frame
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.bundles import run_bundles
 from roadscan.run.engine.fingerprint import key_of
@@ -127,7 +126,7 @@ def no_folder_of_frames() -> ConfigError:
 
 def _of_video(plan: SurveyPlan, taken: TakenPictures) -> list[FrameTask]:
     """Returns a task for each key frame of a video."""
-    record, code = taken.record, code_digest("roadscan.pictures.frames.files:write_frame")
+    record, code = taken.record, code_digest("roadscan.pictures.frames.chosen:write_frame")
     path = plan.survey.resolve(Path(record.path))
     off_s = max(_OFF / float(record.attributes["fps"]), _LEAST_OFF_S)
     tasks = []

@@ -18,7 +18,7 @@ import pyarrow as pa
 from roadscan.compute.array_types import Bool, Int64
 from roadscan.pictures.exposures import Exposures
 from roadscan.pictures.lens import pixels_of, rays_of
-from roadscan.pictures.ties.features import Features, alike
+from roadscan.pictures.ties.matching import Features, alike
 from roadscan.pictures.views import Lens
 
 OWN_VEHICLE: Final = "picture_own_vehicle"

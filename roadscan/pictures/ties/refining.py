@@ -18,11 +18,10 @@ import pyarrow as pa
 
 from roadscan.compute.array_types import Float32, Float64, Int64
 from roadscan.core.extras import cv2
-from roadscan.pictures.files import read_picture
+from roadscan.pictures.frames.chosen import read_picture
 from roadscan.pictures.kernels.patch_matching import match_patches
 from roadscan.pictures.lens import derivatives, rays_of
-from roadscan.pictures.ties.chains import CHAINS, TRACKS, Chains, chains_of, rows_of
-from roadscan.pictures.ties.tracks import places_of
+from roadscan.pictures.ties.tracks import CHAINS, TRACKS, Chains, chains_of, places_of, rows_of
 from roadscan.pictures.ties.work import ALL, FEATURES, TieWork, written
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of

@@ -12,9 +12,9 @@ from roadscan.core.extras import need
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import poses_plan_of
-from roadscan.pictures.ties.chains import CHAINS, TRACKS, chains_key, write_chains
 from roadscan.pictures.ties.own_vehicle import OWN_VEHICLE
 from roadscan.pictures.ties.refining import REFINED, refine_picture, refine_tasks, tracks_key, write_tracks
+from roadscan.pictures.ties.tracks import CHAINS, TRACKS, chains_key, write_chains
 from roadscan.pictures.ties.work import (
     ALL,
     FEATURES,

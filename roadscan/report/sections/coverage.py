@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from itertools import cycle
 from typing import Any, Final
@@ -11,15 +11,59 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.core.gpstime import NS_PER_S
-from roadscan.core.ids import TileId
+from roadscan.core.gpstime import NS_PER_S, utc_from_gps_ns
+from roadscan.core.grid import TileId
 from roadscan.georeference.plan.plan import NothingToPlaceError, plan_of
-from roadscan.report.blocks import COLOURS, WIDTH, Block, Drawing, Line, MapPage, Table
+from roadscan.report.blocks import COLOURS, WIDTH, Block, Drawing, Line, MapPage, Paragraph, Table
 from roadscan.report.section import Material, Section
-from roadscan.report.sections.recorded import seconds_of
+from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import OutputRecord
 from roadscan.tiles.drives import Drives
 from roadscan.tiles.tasks.tile_plan import TILE
+
+
+class Recorded(Section):
+    """Logs with their spans, rejected records by reason, readings by result."""
+
+    name = "recorded"
+    title = "What was recorded"
+    position = 100
+
+    def blocks(self, material: Material) -> Iterator[Block]:
+        """Yield a row per log; rejects by reason; counts of readings."""
+        if not material.logs:
+            return
+        yield Table(
+            ("log", "run", "sensor", "format", "first epoch", "last epoch", "rows", "rejected"),
+            [_row(r) for r in material.logs],
+        )
+        reasons: Counter[str] = Counter()
+        for record in material.logs:
+            reasons.update(record.reject_reasons)
+        if reasons:
+            rows = [(reason, f"{count:,}") for reason, count in reasons.most_common()]
+            yield Table(("reason", "records"), rows, "Records that could not be used", "rejects")
+        fates = material.summary.readings
+        if fates:
+            total = sum(fates.values())
+            shares = [(name.replace("_", " "), f"{count:,}", f"{count / total:.2%}") for name, count in fates.items()]
+            yield Table(("what became of it", "readings", "share"), shares, "Readings")
+
+
+def seconds_of(epoch_gps_ns: int) -> str:
+    """Return ``2026-05-04 09:30:00`` (UTC) for a GPS epoch."""
+    return f"{utc_from_gps_ns(epoch_gps_ns):%Y-%m-%d %H:%M:%S}"
+
+
+def _row(record: LogRecord) -> tuple[str, ...]:
+    spans = [span for table in record.tables if (span := record.span(table)) is not None]
+    first = seconds_of(min(s[0] for s in spans)) if spans else "–"
+    last = seconds_of(max(s[1] for s in spans)) if spans else "–"
+    return (
+        record.path, record.run, record.sensor, record.format, first, last,
+        f"{record.rows:,}", f"{record.rejected:,}",
+    )  # fmt: skip
+
 
 _ONE_PASS: Final = "#cfd6dd"
 _OVERLAPPED: Final = "#9fb4c7"
@@ -103,3 +147,20 @@ def _points(places: Float64) -> str:
     step = max(1, math.ceil(len(places) / _MOST_POINTS))
     kept = np.concatenate([places[::step], places[-1:]])
     return " ".join(f"{x:.1f},{y:.1f}" for x, y in kept.tolist())
+
+
+class Doubts(Section):
+    """Inputs that were left out, and doubtful ones."""
+
+    name = "doubts"
+    title = "What was left out, and what is doubtful"
+    position = 20
+
+    def blocks(self, material: Material) -> Iterator[Block]:
+        """A row for each finding."""
+        found = material.summary.findings
+        if not found:
+            yield Paragraph("No witness of the inputs contradicts them.")
+            return
+        rows = [(one.subject, one.text, f"{one.left_out:,}" if one.left_out else "–") for one in found]
+        yield Table(("input", "what was found", "left out"), rows, numbers=False)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from roadscan.calibrate.tasks.calibrate import PICTURE
-from roadscan.calibrate.tasks.mounting_status import mounting_lines
+from roadscan.calibrate.tasks.calibrate import PICTURE, mounting_lines
 from roadscan.navigation.tasks.navigation_status import NavigationStatus, navigation_status, trajectory_findings
 from roadscan.report.blocks import Block, Paragraph, Picture
 from roadscan.report.section import Material, Section

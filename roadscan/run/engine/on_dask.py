@@ -20,7 +20,7 @@ from roadscan.core.errors import RoadscanError, RunError
 from roadscan.core.extras import need
 from roadscan.run.engine.compute import Done
 from roadscan.run.engine.watch import OtherVersionError, Watch, check_version, refuse_others, title_of
-from roadscan.store.holding.look import others_write
+from roadscan.store.holders import others_write
 
 T = TypeVar("T")
 R = TypeVar("R")

@@ -17,8 +17,7 @@ from pydantic import BaseModel, Field, model_validator
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.strict import NAME_PATTERN, Strict, load_toml
 from roadscan.simulate.lidar_model import lidar_model
-from roadscan.simulate.scene.albedo import SurfaceAlbedo
-from roadscan.simulate.scene.camera import Camera, FurtherCamera
+from roadscan.simulate.scene.camera import Camera, FurtherCamera, SurfaceAlbedo
 from roadscan.simulate.scene.rig import (
     Bag,
     ClockError,
@@ -30,13 +29,15 @@ from roadscan.simulate.scene.rig import (
     Mount,
     MountError,
     Noise,
+    PassScene,
     Profilers,
+    Route,
     Sick,
     Trajectory,
+    Vehicle,
 )
 from roadscan.simulate.scene.road import Element, Road
 from roadscan.simulate.scene.roadside import Barrier, Roadside
-from roadscan.simulate.scene.vehicle import PassScene, Route, Vehicle
 
 __all__ = [
     "Bag",

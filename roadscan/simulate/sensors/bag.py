@@ -31,7 +31,7 @@ from roadscan.simulate.drive import Drive
 from roadscan.simulate.lidar_model import lidar_model
 from roadscan.simulate.noise import stream
 from roadscan.simulate.scene import ClockError, Mount, Scene
-from roadscan.simulate.sensors import gnss, imu, lidar
+from roadscan.simulate.sensors import gnss, lidar
 from roadscan.simulate.sensors.clock import SensorClock
 from roadscan.simulate.sensors.lidar import BODY_FROM_AXES, Packets
 
@@ -152,7 +152,7 @@ class _Messages:
 
     def mountings(self) -> Iterator[_Sent]:
         """Yield the transforms from the vehicle to the sensors, once."""
-        rig = {"lidar": self.scene.lidar.mount, "imu_link": imu.AT_BODY,
+        rig = {"lidar": self.scene.lidar.mount, "imu_link": gnss.AT_BODY,
                "gnss": gnss.antenna_mount(self.scene)}  # fmt: skip
         epoch = lidar.starts_gps_ns(self.drive) - NS_PER_S  # before all others
         stamp = self._utc_ns(epoch)
@@ -182,7 +182,7 @@ class _Messages:
         none = get["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
         no_attitude = np.array([-1.0, *[0.0] * 8])
         number = 0
-        for epochs, rate, force in imu.samples(self.scene, self.drive, imu.imu_of(self.scene)):
+        for epochs, rate, force in gnss.samples(self.scene, self.drive, gnss.imu_of(self.scene)):
             rates, forces = rate @ BODY_FROM_AXES, force @ BODY_FROM_AXES
             stamps = clock.stamps_ns(epochs).tolist()
             for epoch, stamp, w, f in zip(epochs.tolist(), stamps, rates, forces, strict=True):

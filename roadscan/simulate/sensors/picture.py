@@ -20,9 +20,8 @@ from roadscan.simulate.caster import Hits, Pattern, World, ray_key
 from roadscan.simulate.drive import Drive
 from roadscan.simulate.noise import stream
 from roadscan.simulate.scene import Camera
-from roadscan.simulate.sensors.albedo import Albedos
-from roadscan.simulate.sensors.albedo import Seen as SeenPlaces
-from roadscan.simulate.sensors.colours import SKY, Tints
+from roadscan.simulate.sensors.colours import SKY, Albedos, Tints
+from roadscan.simulate.sensors.colours import Seen as SeenPlaces
 from roadscan.simulate.sensors.lens import Lens, Sphere
 
 FloatArray = TypeVar("FloatArray", Float32, Float64)

@@ -38,8 +38,7 @@ from roadscan.simulate.kernels.things import (
 from roadscan.simulate.noise import stream
 from roadscan.simulate.scene import Mount, Profilers, Scene
 from roadscan.simulate.scene.roadside import MovingCar
-from roadscan.simulate.sensors.clock import SensorClock
-from roadscan.simulate.sensors.encoder import WheelEncoder
+from roadscan.simulate.sensors.clock import SensorClock, WheelEncoder
 from roadscan.simulate.surface import Surface
 from roadscan.simulate.things import Object, mover_bodies, moving_objects
 

@@ -30,8 +30,15 @@ from roadscan.site.layer import (
     evidence_of_row,
 )
 from roadscan.site.material import Material
-from roadscan.store.asset_schema import AssetColumn, AssetSchema, asset_kind_names, asset_schema
-from roadscan.store.inventory_schema import GEOMETRY, asset_columns, editable_columns
+from roadscan.store.asset_schema import (
+    GEOMETRY,
+    AssetColumn,
+    AssetSchema,
+    asset_columns,
+    asset_kind_names,
+    asset_schema,
+    editable_columns,
+)
 
 FOLDER: Final = "products/assets"
 GEOMETRY_OF: Final[dict[str, Geometry]] = {

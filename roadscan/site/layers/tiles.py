@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 
 from roadscan.core.errors import DamagedError, RoadscanError
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.site import layer
 from roadscan.site.layer import (
     BLUE,

@@ -18,16 +18,14 @@ import shapely
 
 from roadscan.core.crs import MapFrame, crs_from_text
 from roadscan.core.gpstime import utc_from_gps_ns
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
-from roadscan.site.document import Ask, Document, json_document
+from roadscan.site.document import Ask, Document, SitePart, json_document
 from roadscan.site.material import Material
-from roadscan.site.part import SitePart
 from roadscan.site.parts.clouds import cloud_box_m, cloud_sheets, cloud_url
-from roadscan.site.parts.cogs import cog_records, cog_url
-from roadscan.site.parts.features import features_url
-from roadscan.site.parts.vectors import site_layers
+from roadscan.site.parts.rasters import cog_records, cog_url
+from roadscan.site.parts.vectors import features_url, site_layers
 from roadscan.store.codecs import SOFTWARE
 
 STAC: Final = "1.1.0"

@@ -11,18 +11,17 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 from roadscan.core.errors import DamagedError, RoadscanError, StoreError
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.footprints.footprints import footprints_of
 from roadscan.georeference.cloud import TilePoints
 from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
 from roadscan.site.cloud_file import PointSpool, write_cloud
-from roadscan.site.document import Ask, Document, json_document
+from roadscan.site.document import Ask, Document, SitePart, json_document
 from roadscan.site.layer import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY
 from roadscan.site.layers.passes import RUN_COLOURS
 from roadscan.site.material import Material
-from roadscan.site.part import SitePart
 from roadscan.tiles.blocks import cut_blocks
 from roadscan.tiles.products.cloud_records import Lattice
 from roadscan.tiles.tasks.tile_plan import TilePlan, tiles_of

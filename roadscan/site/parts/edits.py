@@ -7,13 +7,12 @@ from typing import Any, Final
 
 from roadscan.core.errors import DamagedError
 from roadscan.inventory.homes.page_edits import LAYER
-from roadscan.site.document import Document, json_document
+from roadscan.site.document import Document, SitePart, json_document
 from roadscan.site.layers.assets import GEOMETRY_OF, site_column
 from roadscan.site.material import Material
-from roadscan.site.part import SitePart
 from roadscan.site.parts.vectors import site_layers
-from roadscan.store.asset_schema import asset_kind_names, asset_schema
-from roadscan.store.inventory_schema import asset_columns, editable_columns
+from roadscan.site.site_pictures import placed_pictures
+from roadscan.store.asset_schema import asset_columns, asset_kind_names, asset_schema, editable_columns
 
 POST: Final = "edits"
 """Path at which a server takes edits."""
@@ -72,3 +71,33 @@ def _about(material: Material) -> dict[str, Any] | None:
     post = POST if material.wishes.edits == "post" else None
     about = {"layers": layers, "kinds": kinds(), "forms": FORMS, "post": post}
     return about | {"inventory": name, "commit": state.commit}
+
+
+MEASURE: Final = "measure"
+"""Path at which a server gives places of pixels."""
+CONTROL: Final = "control"
+"""Path at which a server takes control points that are clicked in pictures."""
+
+
+class Measuring(SitePart):
+    """What a page may ask the server about its pictures."""
+
+    name = "measuring"
+    position = 650
+
+    def members(self, material: Material) -> Mapping[str, Any]:
+        """Return the paths; null where no server answers, or there are no pictures."""
+        if not material.wishes.stays_here or placed_pictures(material) is None:
+            return {"measuring": None}
+        takes = material.wishes.edits == "post" and has_control(material)
+        return {"measuring": {"measure": MEASURE, "control": CONTROL if takes else None}}
+
+    def documents(self, material: Material) -> Iterator[Document]:
+        """Yield nothing: all of it is asked for."""
+        yield from ()
+
+
+def has_control(material: Material) -> bool:
+    """Return True where the survey has control points and pictures that may see them."""
+    has_points = any(record.tables.get("control_points") for record in material.plan.records)
+    return has_points and placed_pictures(material) is not None

@@ -6,10 +6,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from roadscan.core.ids import TileId
-from roadscan.site.document import Ask, Document, json_document
+from roadscan.core.grid import TileId
+from roadscan.site.document import Ask, Document, SitePart, json_document
 from roadscan.site.material import Material
-from roadscan.site.part import SitePart
 from roadscan.store.codecs.mesh import stated_in_glb
 from roadscan.store.manifest import OutputRecord, read_recorded
 

@@ -17,10 +17,9 @@ import shapely
 from roadscan.condition.index import condition_indices
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.fingerprint import key_of
-from roadscan.site.document import Ask, Document, json_bytes
+from roadscan.site.document import Ask, Document, SitePart, json_bytes
 from roadscan.site.layer import title_of
 from roadscan.site.material import Material
-from roadscan.site.part import SitePart
 from roadscan.store.manifest import OutputRecord, recorded_table
 
 _SERIES: Final = ("station_from_m", "station_to_m", "value", "sigma", "share", "reason")

@@ -10,12 +10,13 @@ JPEG: ITU-T T.81, annex B. PNG: W3C PNG (third edition), sections 5 and 11. TIFF
 from __future__ import annotations
 
 import io
+import math
 import struct
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import Any, BinaryIO, Final
 
 from roadscan.store.codecs.zlib_stream import crc32
 
@@ -269,3 +270,163 @@ def _tiff(stream: BinaryIO, size: int) -> ImageSize:
     if not sum(counts):
         raise ImageError("the image holds no pixels")
     return ImageSize(width, height)
+
+
+_FILM_DIAGONAL_MM: Final = math.hypot(36.0, 24.0)
+"""Diagonal of the 35 mm film that FocalLengthIn35mmFilm refers to (CIPA DCG-001)."""
+_TURNED: Final = {3: "to be turned by 180°", 6: "to be turned by 90° clockwise", 8: "to be turned by 90° anticlockwise"}
+"""How a picture becomes upright, by Orientation; 1 is upright, the others are mirrored."""
+_UPRIGHT: Final = 1  # Orientation of an upright picture
+
+
+def picture_tags(path: Path) -> dict[str, Any]:
+    """Return what the tags of a picture state, JSON values by name; nothing of a damaged picture.
+
+    taken (with its offset from UTC where stated), camera, focal_mm, focal_35mm_mm, focal_px (from the latter and the
+    picture's diagonal), size_px, orientation (where not upright), latitude_deg, longitude_deg, altitude_m.
+    """
+    from PIL import ExifTags, Image
+
+    try:
+        with Image.open(path) as image:
+            tags = image.getexif()
+            shot, place = tags.get_ifd(ExifTags.IFD.Exif), tags.get_ifd(ExifTags.IFD.GPSInfo)
+            base = ExifTags.Base
+            taken = _text(shot.get(base.DateTimeOriginal)) or _text(tags.get(base.DateTime))
+            film_mm = _number(shot.get(base.FocalLengthIn35mmFilm))
+            orientation = _number(tags.get(base.Orientation)) or _UPRIGHT
+            found = {
+                "taken": " ".join(filter(None, (taken, _text(shot.get(base.OffsetTimeOriginal))))),
+                "camera": " ".join(filter(None, (_text(tags.get(base.Make)), _text(tags.get(base.Model))))),
+                "focal_mm": _number(shot.get(base.FocalLength)),
+                "focal_35mm_mm": film_mm,
+                "focal_px": None if not film_mm else round(film_mm / _FILM_DIAGONAL_MM * math.hypot(*image.size), 1),
+                "size_px": list(image.size),
+                "orientation": "" if orientation == _UPRIGHT else _TURNED.get(int(orientation), "mirrored"),
+                "latitude_deg": _degrees(place, ExifTags.GPS.GPSLatitude, ExifTags.GPS.GPSLatitudeRef, "S"),
+                "longitude_deg": _degrees(place, ExifTags.GPS.GPSLongitude, ExifTags.GPS.GPSLongitudeRef, "W"),
+                "altitude_m": _number(place.get(ExifTags.GPS.GPSAltitude)),
+            }
+    except Exception:  # noqa: BLE001 — Pillow raises anything on damaged bytes
+        return {}
+    stated = {name: value for name, value in found.items() if value not in (None, "")}
+    return stated if stated.keys() - {"size_px"} else {}
+
+
+def tags_in_words(tags: Mapping[str, Any]) -> str:
+    """Return what :func:`picture_tags` found as a list of words; "" for nothing."""
+    parts = [
+        ("taken", "taken {taken} on the camera's own clock"),
+        ("camera", "{camera}"),
+        ("focal_mm", "focal length {focal_mm:g} mm"),
+        ("focal_px", "{focal_px:g} pixels by its equivalent of {focal_35mm_mm:g} mm film"),
+        ("orientation", "{orientation}"),
+        ("latitude_deg", "at {latitude_deg:.6f}°, {longitude_deg:.6f}°"),
+        ("altitude_m", "{altitude_m:g} m high"),
+    ]
+    known = [words for name, words in parts if name in tags and (name != "latitude_deg" or "longitude_deg" in tags)]
+    return ", ".join(words.format(**tags) for words in known)
+
+
+def _text(value: Any) -> str:
+    return str(value).strip(" \0") if isinstance(value, str) else ""
+
+
+def _number(value: Any) -> float | None:
+    """Return a finite number, None for anything else: a denominator may be 0."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _degrees(place: Mapping[int, Any], tag: int, reference: int, negative: str) -> float | None:
+    """Return an angle of three rational numbers (degrees, minutes, seconds), None where it is none."""
+    values = place.get(tag)
+    parts = [_number(value) for value in values] if isinstance(values, tuple) and len(values) == 3 else [None]
+    if any(part is None for part in parts):
+        return None
+    degrees, minutes, seconds = (part or 0.0 for part in parts)
+    angle = degrees + minutes / 60 + seconds / 3600
+    return -angle if _text(place.get(reference)) == negative else angle
+
+
+_START: Final = b"\xff\xd8"
+_APP1: Final = b"\xff\xe1"
+_COMMENT: Final = b"\xff\xfe"
+_EXIF: Final = b"Exif\0\0"
+_XMP: Final = b"http://ns.adobe.com/xap/1.0/\0"
+_LARGEST: Final = 0xFFFF - 2  # Bytes that a segment can hold.
+_JPEG_SEGMENTS_WITHOUT_LENGTH: Final = (0x01, *range(0xD0, 0xD9))  # Markers that no length follows.
+_JPEG_SEGMENTS_SCAN: Final = 0xDA  # The marker after which the picture's data follow.
+
+
+def with_tags(jpeg: bytes, exif: bytes, xmp: bytes) -> bytes:
+    """Return a JPEG with these tags in place of its own; all other bytes are as they were.
+
+    Parameters
+    ----------
+    exif : TIFF structure, with or without the leading ``Exif``; xmp : the packet.
+
+    Raises
+    ------
+    ValueError
+        where it is no JPEG, or a segment would be too long.
+    """
+    if not jpeg.startswith(_START):
+        raise ValueError("it does not begin as a JPEG")
+    content = exif if exif.startswith(_EXIF) else _EXIF + exif
+    return _START + _segment(content) + _segment(_XMP + xmp) + _without_tags(jpeg)
+
+
+def without_tags(jpeg: bytes) -> bytes:
+    """Return a JPEG without EXIF and XMP; raises ValueError where it is none."""
+    if not jpeg.startswith(_START):
+        raise ValueError("it does not begin as a JPEG")
+    return _START + _without_tags(jpeg)
+
+
+def with_comment(jpeg: bytes, text: str) -> bytes:
+    """Return a JPEG with a comment (COM) after its start; raises ValueError where it is none."""
+    if not jpeg.startswith(_START):
+        raise ValueError("it does not begin as a JPEG")
+    content = text.encode()
+    return _START + _COMMENT + (len(content) + 2).to_bytes(2, "big") + content + jpeg[2:]
+
+
+def comment_of(jpeg: bytes) -> str:
+    """Return the comment that :func:`with_comment` put there; raises ValueError where there is none."""
+    if not jpeg.startswith(_START + _COMMENT):
+        raise ValueError("it has no comment after its start")
+    return jpeg[6 : 4 + int.from_bytes(jpeg[4:6], "big")].decode()
+
+
+def _segment(content: bytes) -> bytes:
+    if len(content) > _LARGEST:
+        raise ValueError(f"a segment of {len(content)} bytes, more than {_LARGEST}")
+    return _APP1 + (len(content) + 2).to_bytes(2, "big") + content
+
+
+def _without_tags(jpeg: bytes) -> bytes:
+    """Return what follows the start of a JPEG without its segments of EXIF and XMP."""
+    kept, at = bytearray(), 2
+    while at + 4 <= len(jpeg):
+        if jpeg[at] != 0xFF:
+            raise ValueError(f"no segment begins at byte {at}")
+        marker = jpeg[at + 1]
+        if marker == _JPEG_SEGMENTS_SCAN:
+            break
+        if marker == 0xFF:  # a fill byte
+            at += 1
+            continue
+        if marker in _JPEG_SEGMENTS_WITHOUT_LENGTH:
+            kept += jpeg[at : at + 2]
+            at += 2
+            continue
+        length = int.from_bytes(jpeg[at + 2 : at + 4], "big")
+        segment = jpeg[at : at + 2 + length]
+        if not (marker == 0xE1 and segment[4:].startswith((_EXIF, _XMP))):
+            kept += segment
+        at += 2 + length
+    return bytes(kept) + jpeg[at:]

@@ -7,16 +7,24 @@ nothing is left out (offset and size 0), as GDAL reads sparse files.
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import re
 import struct
-from collections.abc import Iterable, Sequence
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from blake3 import blake3
 
+from roadscan.core.crs import MapFrame
 from roadscan.core.errors import StoreError
+
+if TYPE_CHECKING:
+    from rasterio.crs import CRS
+
 
 DIGEST_ITEM: Final = "ROADSCAN_FILE_BLAKE3"
 """Metadata item with the BLAKE3 digest (128 bits, hexadecimal) of the file with this digest's characters as 0."""
@@ -150,3 +158,33 @@ def _digest(parts: Iterable[Any]) -> bytes:
     for part in parts:
         digest.update(part)
     return digest.hexdigest(length=16).encode()
+
+
+_CACHE_BYTES: Final = 64 * 2**20  # block cache of GDAL
+
+
+@functools.lru_cache(maxsize=16)
+def raster_crs(frame: MapFrame) -> CRS:
+    """Return the CRS of the map for rasterio, compound where a vertical CRS is named."""
+    from rasterio.crs import CRS
+
+    return CRS.from_wkt(frame.wkt())
+
+
+@contextlib.contextmanager
+def raster_settings() -> Iterator[None]:
+    """Run GDAL with one file per raster, one thread, and a block cache of constant size."""
+    import rasterio
+
+    with rasterio.Env(GDAL_PAM_ENABLED="NO", GDAL_NUM_THREADS="1", GDAL_CACHEMAX=_CACHE_BYTES):
+        yield
+
+
+@contextlib.contextmanager
+def without_place_warning() -> Iterator[None]:
+    """Suppress rasterio's warning about files without georeference, such as pictures."""
+    from rasterio.errors import NotGeoreferencedWarning
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        yield

@@ -21,7 +21,7 @@ import numpy as np
 from roadscan.compute.kernel_options import bare, bare_inner, kernel
 from roadscan.compute.kernels.covariances import PEAK, REACH, covariances, slope_covariances
 from roadscan.compute.kernels.factorisation import LANES, TOGETHER, factorise
-from roadscan.surface.kernels.vertex_neighbourhoods import MOST, MOST_RINGS, grow, is_narrow, whitening
+from roadscan.surface.kernels.delaunay import MOST, MOST_RINGS, grow, is_narrow, whitening
 
 TERMS, HEIGHTS, ALONG_U, ALONG_V, SIDES = 6, 6, 7, 8, 9
 """Rows below the covariances: 1, u², u v, v², u, v; then heights; then covariances with the slopes at the centre."""
@@ -127,7 +127,7 @@ def spline_gradients(x, y, z, first, order, members, counts, axes, work, fitted,
     Parameters
     ----------
     x, y, z : (m,) float64 (m), differences of x and y exact.
-    first, members, counts, axes : of :func:`roadscan.surface.kernels.vertex_neighbourhoods.neighbourhoods`.
+    first, members, counts, axes : of :func:`roadscan.surface.kernels.delaunay.neighbourhoods`.
     order : (k,) int64: the wanted ones, by ascending count.
     work : WORK, float64; faster at a multiple of 64 bytes.
     fitted : value of `sources` for the gradients found.

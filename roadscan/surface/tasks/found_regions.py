@@ -19,8 +19,7 @@ import shapely
 from roadscan.core.crs import LOCAL_WORLD, MapFrame
 from roadscan.core.errors import ConfigError
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.core.grid import Bounds
-from roadscan.core.ids import TileId
+from roadscan.core.grid import Bounds, TileId
 from roadscan.core.survey import Survey
 from roadscan.footprints.footprints import FootprintRanges
 from roadscan.formats.vectors.road_lines import place_in_map
@@ -45,10 +44,9 @@ from roadscan.store.logs import DataFile
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
-from roadscan.surface.coarse import CoarseSettings, Stretch, coarse_model
-from roadscan.surface.regions import Region, find_regions
+from roadscan.surface.regions import CoarseSettings, Region, Stretch, coarse_model, find_regions
 from roadscan.surface.settings import RegionSettings, SurfaceConfig
-from roadscan.surface.window import GridWindow
+from roadscan.surface.tile import GridWindow
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.geo_table import read_geo_table, write_geo_table
 from roadscan.tiles.tasks.wanted_products import product_context

@@ -11,14 +11,14 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.georeference.cloud import TilePoints
 from roadscan.run.engine.compute import damaged_file, reason_of
 from roadscan.store.manifest import OutputRecord
 from roadscan.surface.reconstruction import Patch, SurfaceGrid, patch_of_cells, patch_of_points, surface_of
-from roadscan.surface.tasks.surface_colours import Painter
-from roadscan.surface.tasks.surface_plan import SURFACE, SurfaceTask
-from roadscan.surface.tile import FILLED, INTERPOLATED, MEASURED, SurfaceTile
+from roadscan.surface.regions import FILLED, INTERPOLATED, MEASURED
+from roadscan.surface.tasks.surface_plan import SURFACE, Painter, SurfaceTask
+from roadscan.surface.tile import SurfaceTile
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.tasks.cell_files import read_cells

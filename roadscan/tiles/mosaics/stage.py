@@ -18,8 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.errors import RoadscanError
-from roadscan.core.grid import ENOUGH, LARGEST_M, TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import ENOUGH, LARGEST_M, TileGrid, TileId
 from roadscan.core.survey import Survey
 from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session

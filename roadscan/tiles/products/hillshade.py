@@ -14,11 +14,11 @@ import numpy.typing as npt
 from pydantic import Field
 
 from roadscan.compute.array_types import Float64
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.core.strict import Strict
 from roadscan.store.codecs.cog import Band
-from roadscan.store.codecs.gdal import raster_settings
 from roadscan.store.codecs.grey_picture import check_picture
+from roadscan.store.codecs.tiff import raster_settings
 from roadscan.tiles.product import Cells, LoadCells, Output, ProductContext, SurveyProduct, TileSummary
 from roadscan.tiles.products.raster import CellBox, SparseRaster, cell_image, paste_tile
 from roadscan.tiles.products.relief_picture import PNG_SIGNATURE, MeanPixels, write_picture

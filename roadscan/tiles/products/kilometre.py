@@ -12,8 +12,7 @@ import numpy.typing as npt
 from pydantic import Field
 
 from roadscan.core.errors import StoreError
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileGrid, TileId
 from roadscan.core.strict import Strict
 from roadscan.store.codecs.cog import Band, write_sparse_cog
 from roadscan.tiles.product import Cells, LoadCells, Output, ProductContext, SurveyProduct, TileSummary

@@ -9,9 +9,9 @@ from typing import ClassVar, cast
 import numpy as np
 from pydantic import Field
 
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.core.strict import Strict
-from roadscan.store.codecs.gdal import raster_settings
+from roadscan.store.codecs.tiff import raster_settings
 from roadscan.tiles.product import Cells, LoadCells, Output, ProductContext, SurveyProduct, TileSummary
 from roadscan.tiles.products.raster import (
     QUANTITIES,

@@ -13,8 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.crs import MapFrame
-from roadscan.core.grid import QUANTA_PER_M, TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import QUANTA_PER_M, TileGrid, TileId
 from roadscan.store.codecs.cog import BLOCK, About, Band, write_sparse_cog
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.product import ProductContext

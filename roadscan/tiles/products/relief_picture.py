@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.array_types import Float64, Int64
-from roadscan.store.codecs.gdal import raster_settings, without_place_warning
+from roadscan.store.codecs.tiff import raster_settings, without_place_warning
 
 PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
 

@@ -13,8 +13,7 @@ from typing import Final
 from roadscan.core.crs import MapFrame, crs_from_text
 from roadscan.core.errors import StoreError
 from roadscan.core.gpstime import utc_from_gps_ns
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileGrid, TileId
 from roadscan.store.codecs.cog import Band, overview_factors
 from roadscan.store.codecs.tiff import check_cog
 from roadscan.tiles.cells import TileCells

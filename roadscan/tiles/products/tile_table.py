@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.core.strict import Strict
 from roadscan.tiles.product import LoadCells, Output, ProductContext, SurveyProduct, TileSummary
 from roadscan.tiles.products.geo_table import check_geo_table, write_geo_table

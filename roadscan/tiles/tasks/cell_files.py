@@ -19,11 +19,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.core.errors import DamagedError, StoreError
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.core.survey import CellColumns
 from roadscan.store.damage import UNREADABLE
 from roadscan.store.manifest import OutputRecord, recorded_table
-from roadscan.store.readings.byte_source import opened
+from roadscan.store.readings.group_reader import opened
 from roadscan.store.schema import table_schema
 from roadscan.store.store import MADE_AGAIN, Store
 from roadscan.tiles.cells import TileCells

@@ -9,8 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from roadscan.compute.robust import scatter_about
-from roadscan.core.grid import QUANTUM_M, TileGrid
-from roadscan.core.ids import LanePass
+from roadscan.core.grid import QUANTUM_M, LanePass, TileGrid
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.cloud import TilePoints
 

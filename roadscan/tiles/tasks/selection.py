@@ -6,8 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from roadscan.core.grid import Bounds, TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import Bounds, TileGrid, TileId
 from roadscan.footprints.footprints import FootprintRanges
 from roadscan.run.selection import Selection, SelectionError
 

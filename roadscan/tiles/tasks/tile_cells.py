@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.errors import StoreError
-from roadscan.core.ids import LanePass, TileId
+from roadscan.core.grid import LanePass, TileId
 from roadscan.georeference.place import pass_numbers
 from roadscan.georeference.reading_counts import ReadingCounts
 from roadscan.georeference.sources import Georeferencer, RawSlice, geometry_of

@@ -10,7 +10,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.footprints.footprints import PRODUCT as FOOTPRINTS
 from roadscan.georeference.reading_counts import LogCounts
 from roadscan.store.manifest import Manifest, OutputRecord

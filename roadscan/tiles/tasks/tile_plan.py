@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.array_types import Int64
-from roadscan.core.ids import LanePass, TileId
+from roadscan.core.grid import LanePass, TileId
 from roadscan.core.survey import CellColumns
 from roadscan.footprints.footprints import FootprintRanges, footprints_of
 from roadscan.footprints.row_groups import GroupsByTile

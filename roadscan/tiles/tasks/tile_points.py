@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.core.grid import QUANTUM_M
-from roadscan.core.ids import TileId
-from roadscan.georeference.centre_line import CentreLineBuffer
-from roadscan.georeference.classes import KEPT, LAS_CLASSES, OFF_CENTRE_LINE, WITHHELD_FLAG
+from roadscan.core.grid import QUANTUM_M, TileId
 from roadscan.georeference.cloud import TilePoints, canonical_order, fill_of
 from roadscan.georeference.place import EXTRA_COLUMNS, Placed, Window, passes_of
-from roadscan.georeference.plan.centre_line import load_buffer
+from roadscan.georeference.plan.centre_line import CentreLineBuffer, load_buffer
 from roadscan.georeference.reading_counts import ReadingCounts
+from roadscan.georeference.road_profiles import KEPT, LAS_CLASSES, OFF_CENTRE_LINE, WITHHELD_FLAG
 from roadscan.georeference.sources import Georeferencer, MapSettings, RawSlice, ReadingSource
 from roadscan.poses.trajectory import Trajectory
 from roadscan.tiles.cells import TileEvidence

@@ -12,7 +12,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from roadscan.core.gpstime import utc_from_gps_ns
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.georeference.reading_counts import ReadingCounts
 from roadscan.run.engine.compute import Compute, reason_of
 from roadscan.store.manifest import Manifest

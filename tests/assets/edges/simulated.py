@@ -10,8 +10,8 @@ import numpy as np
 from roadscan.simulate import Scene
 from roadscan.simulate.caster import World
 from roadscan.simulate.drive import drives_of
-from roadscan.simulate.earth import Earth
 from roadscan.simulate.lidar_model import lidar_model
+from roadscan.simulate.path import Earth
 from roadscan.simulate.sensors import lidar
 from roadscan.simulate.surface import Surface
 from tests.assets.edges.streets import Street, returns_of

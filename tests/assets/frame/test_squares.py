@@ -19,8 +19,7 @@ from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.tasks.lines import Roads
 from roadscan.core.crs import MapFrame
 from roadscan.core.errors import ConfigError
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileGrid, TileId
 from roadscan.core.rig import Mounting, Mountings
 from roadscan.georeference.sensor_places import sensor_places
 from roadscan.poses.trajectory import Trajectory

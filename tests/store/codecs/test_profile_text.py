@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from roadscan.core.errors import FormatError
-from roadscan.store.codecs.erd import erd_text, is_erd, parse_erd
-from roadscan.store.codecs.profile_text import parse_columns
+from roadscan.store.codecs.road_profiles import erd_text, is_erd, parse_columns, parse_erd
 
 LTPP = """ERDFILEV2.00
       3,      4,     -1,      1,      5,       0.0250,     -1,

@@ -13,7 +13,7 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
 from roadscan.core.errors import StoreError
-from roadscan.store.readings.byte_source import ReadAhead
+from roadscan.store.readings.group_reader import ReadAhead
 from roadscan.store.readings.profiles import ProfileReader
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store

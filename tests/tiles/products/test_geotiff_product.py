@@ -16,10 +16,10 @@ import rasterio
 from rasterio.enums import Resampling
 
 from roadscan.core.errors import StoreError
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.store.codecs import tiff as tiff_module
 from roadscan.store.codecs.cog import overview_factors
-from roadscan.store.codecs.gdal import raster_crs
+from roadscan.store.codecs.tiff import raster_crs
 from roadscan.tiles.product import Tile, product_named
 from roadscan.tiles.products.geotiff import GeoTiff, GeoTiffOptions
 from roadscan.tiles.products.raster import CellBox

@@ -11,7 +11,7 @@ from rasterio.errors import NotGeoreferencedWarning
 from scipy import ndimage
 
 from roadscan.core.errors import StoreError
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.tiles.product import Tile, product_named
 from roadscan.tiles.products.hillshade import Hillshade, HillshadeOptions, horn_slopes, shade
 

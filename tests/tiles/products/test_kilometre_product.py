@@ -8,7 +8,7 @@ import pytest
 import rasterio
 
 from roadscan.core.errors import StoreError
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.tiles.product import Output
 from roadscan.tiles.products.hillshade import shade
 from roadscan.tiles.products.kilometre import Kilometre, KilometreOptions

@@ -22,8 +22,7 @@ from hypothesis import strategies as st
 from roadscan.core.crs import MapFrame
 from roadscan.core.errors import ConfigError, StoreError
 from roadscan.core.gpstime import Clock, TimeSystem
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileGrid, TileId
 from roadscan.georeference.cloud import TilePoints
 from roadscan.tiles.product import Tile, product_named
 from roadscan.tiles.products.las import Las, LasOptions, adjusted_gps_s, thin_out

@@ -11,8 +11,7 @@ import rasterio
 
 from roadscan.core.crs import MapFrame
 from roadscan.core.errors import StoreError
-from roadscan.core.grid import TileGrid
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileGrid, TileId
 from roadscan.tiles.product import Output
 from roadscan.tiles.products.mosaic import Mosaic, MosaicOptions
 from roadscan.tiles.products.sheets import cut_sheets

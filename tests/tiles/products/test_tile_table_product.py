@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from roadscan.core.errors import StoreError
-from roadscan.core.ids import TileId
+from roadscan.core.grid import TileId
 from roadscan.store.schema import table_schema
 from roadscan.tiles.product import NoOptions, product_named
 from roadscan.tiles.products.tile_table import TileTable

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import BinaryIO, Final
 
-from roadscan.formats.ros.containers.storage import (
+from roadscan.formats.ros.storage import (
     BROKEN,
     Chunk,
     ChunkedContainer,

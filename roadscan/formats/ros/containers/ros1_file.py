@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import BinaryIO, Final
 
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.formats.ros.containers.storage import (
+from roadscan.formats.ros.storage import (
     BROKEN,
     Chunk,
     ChunkedContainer,

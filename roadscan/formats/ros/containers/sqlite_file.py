@@ -9,7 +9,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Final
 
-from roadscan.formats.ros.containers.storage import Connection, Container, MessageSpan, Raw, RawItem
+from roadscan.formats.ros.storage import Connection, Container, MessageSpan, Raw, RawItem
 from roadscan.ingest.reading.format import Reject
 
 MAGIC: Final = b"SQLite format 3\0"

@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 
 from roadscan.store.codecs.choice import LIBRARY
 from roadscan.store.codecs.parquet import pages
-from roadscan.store.codecs.parquet.thrift import Value, binary, boolean, i8, i16, i32, i64, listed, struct
+from roadscan.store.codecs.parquet.pages import Value, binary, boolean, i8, i16, i32, i64, listed, struct
 from roadscan.store.codecs.zlib_stream import crc32
 
 MAGIC: Final = b"PAR1"

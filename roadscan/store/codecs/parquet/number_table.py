@@ -20,7 +20,7 @@ from roadscan.store.codecs.choice import LIBRARY
 from roadscan.store.codecs.kernels.byte_planes import LONGEST_RUN_BYTES, encode_runs
 from roadscan.store.codecs.parquet import pages
 from roadscan.store.codecs.parquet.list_table import KINDS, Packed, Page, Writer, chunk
-from roadscan.store.codecs.parquet.thrift import Value, binary, i64, struct, varint, zigzag
+from roadscan.store.codecs.parquet.pages import Value, binary, i64, struct, varint, zigzag
 
 _SCRATCH: Final = 2048  # values of the scratch line that the kernels need
 

@@ -5,20 +5,100 @@ the value's path is there), then the values. Lists of a fixed size have levels t
 values, so a page's levels are compared with those that it has to have, instead of being decoded.
 
 (Apache Parquet format, *parquet.thrift*, and *Encodings.md*, "RLE / bit-packing hybrid".)
+
+Encoder of Thrift's compact protocol, as far as Parquet's headers and footers use it.
+
+(Apache Thrift, *Thrift Compact protocol encoding*.)
 """
 
 from __future__ import annotations
 
 import functools
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.store.codecs.parquet import thrift
+_TRUE, _FALSE, _BYTE, _I16, _I32, _I64, _BINARY, _LIST, _STRUCT = 1, 2, 3, 4, 5, 6, 8, 9, 12  # type codes
+_LONGEST_DELTA: Final = 15  # longer sizes and field deltas need a separate number
+_SHORT: Final = [bytes([number]) for number in range(128)]  # varints of the numbers below 128
+
+
+class Value(NamedTuple):
+    """A value with its type."""
+
+    kind: int
+    content: bytes
+
+
+def varint(number: int) -> bytes:
+    """Return the varint of a non-negative number, seven bits per byte."""
+    if number <= 127:
+        return _SHORT[number]
+    out = bytearray()
+    while number > 127:
+        out.append(number & 127 | 128)
+        number >>= 7
+    out.append(number)
+    return bytes(out)
+
+
+def zigzag(number: int) -> bytes:
+    """Return the varint of a signed number."""
+    return varint(2 * number if number >= 0 else -2 * number - 1)
+
+
+def boolean(value: bool) -> Value:
+    """Return a boolean as a field of a struct."""
+    return Value(_TRUE if value else _FALSE, b"")
+
+
+def i8(number: int) -> Value:
+    """Return an 8-bit number."""
+    return Value(_BYTE, number.to_bytes(1, "little", signed=True))
+
+
+def i16(number: int) -> Value:
+    """Return a 16-bit number."""
+    return Value(_I16, zigzag(number))
+
+
+def i32(number: int) -> Value:
+    """Return a 32-bit number."""
+    return Value(_I32, zigzag(number))
+
+
+def i64(number: int) -> Value:
+    """Return a 64-bit number."""
+    return Value(_I64, zigzag(number))
+
+
+def binary(content: bytes | str) -> Value:
+    """Return bytes, or text in UTF-8."""
+    raw = content.encode() if isinstance(content, str) else content
+    return Value(_BINARY, varint(len(raw)) + raw)
+
+
+def listed(values: Sequence[Value]) -> Value:
+    """Return a list of values of one type."""
+    kind, count = values[0].kind if values else _STRUCT, len(values)
+    head = bytes([count << 4 | kind]) if count < _LONGEST_DELTA else bytes([0xF0 | kind]) + varint(count)
+    return Value(_LIST, head + b"".join(v.content for v in values))
+
+
+def struct(fields: Mapping[int, Value]) -> Value:
+    """Return a struct of fields by number, ascending."""
+    out, before = bytearray(), 0
+    for number, value in fields.items():
+        delta = number - before
+        out += bytes([delta << 4 | value.kind]) if delta <= _LONGEST_DELTA else bytes([value.kind]) + zigzag(number)
+        out += value.content
+        before = number
+    return Value(_STRUCT, bytes(out) + b"\0")
+
 
 PLAIN, RLE, DELTA_BINARY_PACKED, RLE_DICTIONARY, BYTE_STREAM_SPLIT = 0, 3, 5, 8, 9  # encodings (parquet.thrift)
 _NUMBER: Final = b"\x15"
@@ -72,7 +152,7 @@ def varied_list_levels(sizes: npt.NDArray[np.int64]) -> tuple[bytes, int]:
 
 def bit_packed(values: int) -> bytes:
     """Return what precedes one group of bit-packed dictionary indices, which come in eights."""
-    return thrift.varint(-(-values // 8) << 1 | 1)
+    return varint(-(-values // 8) << 1 | 1)
 
 
 def page_header(size: int, crc: int, values: int, encoding: int, raw: int | None = None) -> bytes:
@@ -90,20 +170,20 @@ def dictionary_header(size: int, crc: int, values: int, raw: int) -> bytes:
 
 def _sizes(size: int, crc: int, raw: int | None) -> bytes:
     signed = crc - (1 << 32) if crc >> 31 else crc
-    sizes = _NUMBER + thrift.zigzag(size if raw is None else raw) + _NUMBER + thrift.zigzag(size)
-    return sizes + _NUMBER + thrift.zigzag(signed)
+    sizes = _NUMBER + zigzag(size if raw is None else raw) + _NUMBER + zigzag(size)
+    return sizes + _NUMBER + zigzag(signed)
 
 
 def _about_dictionary(values: int) -> bytes:
     """Return the end of a dictionary's header: the seventh field, a struct, and the stop mark."""
-    return thrift.struct({3: thrift.struct({1: thrift.i32(values), 2: thrift.i32(PLAIN)})}).content
+    return struct({3: struct({1: i32(values), 2: i32(PLAIN)})}).content
 
 
 @functools.lru_cache(maxsize=64)
 def _about(values: int, encoding: int) -> bytes:
     """Return the end of a page's header: its fifth field, a struct, and the stop mark."""
-    own = thrift.struct({k: thrift.i32(v) for k, v in {1: values, 2: encoding, 3: RLE, 4: RLE}.items()})
-    return thrift.struct({1: own}).content
+    own = struct({k: i32(v) for k, v in {1: values, 2: encoding, 3: RLE, 4: RLE}.items()})
+    return struct({1: own}).content
 
 
 class PageHeader(NamedTuple):
@@ -166,4 +246,4 @@ def _bits(levels: Bools) -> bytes:
 
 def _run(count: int, level: int) -> bytes:
     """Return a level repeated `count` times, for a column whose levels fit in a byte."""
-    return thrift.varint(count << 1) + bytes([level])
+    return varint(count << 1) + bytes([level])

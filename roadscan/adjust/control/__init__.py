@@ -1,1 +1,0 @@
-"""Control points as passes saw them, faults of single points, and tests of the control as a whole."""

@@ -1,1 +1,0 @@
-"""Edges of the road's surface on both sides of its lanes."""

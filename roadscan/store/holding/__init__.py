@@ -1,1 +1,0 @@
-"""Who has a store, and what that process knows of it."""

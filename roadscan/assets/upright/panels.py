@@ -19,7 +19,6 @@ from roadscan.assets.scene import Box, Scene
 from roadscan.assets.upright.places import places_of
 from roadscan.assets.upright.regions import LOWEST_M, Region, regions_of
 from roadscan.compute.array_types import Float64, Int64
-from roadscan.compute.robust import scatter_about
 
 STRETCH_M: Final = 1.0  # Length of a stretch (m), about.
 _MOST_LINES: Final = 150_000
@@ -225,7 +224,7 @@ def _on_line(scene: Scene, place: tuple[float, float], along: Float64, middle_m:
         return near[:0], middle_m
     past, off = t[on] - t[on].mean(), d[on] - d[on].mean()
     off -= past * float(past @ off) / max(float(past @ past), 1e-9)
-    if (in_front & (level < top)).sum() > (1.0 - _MOSTLY) * on.sum() or scatter_about(off, median(off)) > _SPREAD_M:
+    if (in_front & (level < top)).sum() > (1.0 - _MOSTLY) * on.sum() or float(np.std(off)) > _SPREAD_M:
         return near[:0], middle_m
     return near[on], middle_m + median(d[on])
 

@@ -107,9 +107,11 @@ def test_a_wall_becomes_one_region_and_a_bush_none() -> None:
 def test_sight_lines_through_a_rectangle() -> None:
     rectangle, bands = np.array([[0.0, 5.0, 4.0, 5.0]]), np.array([[[1.0, 2.0], [2.5, 9.0]]])
     ends = np.array([[2.0, 10.0, 1.0], [2.0, 10.0, 4.0], [2.0, 4.0, 1.5], [9.0, 10.0, 1.5], [2.0, 5.1, 1.5]])
-    passed = np.zeros((1, 2), np.int64)
+    passed = np.zeros((1, 4, 2), np.int64)
     passing_lines(*ends.T.copy(), np.full(5, 2.0), np.zeros(5), np.full(5, 2.0), rectangle, bands, passed)
-    assert passed.tolist() == [[1, 1]]  # at 1.5 and 3 m; the others end before it, beside it, or close behind it
+    assert passed.tolist() == [
+        [[0, 0], [0, 0], [1, 1], [0, 0]]
+    ]  # at 1.5 and 3 m; the others end before it, beside it, or close behind it
 
 
 def test_a_cylinder_seen_from_one_side() -> None:

@@ -188,7 +188,7 @@ def passing_lines(x, y, height, sensor_x, sensor_y, sensor_height, segments, ban
 
     x, y, height : (n,) returns; sensor_x, sensor_y, sensor_height : (n,) where they were seen from (m); segments :
     (s, 4) ends x, y and x, y of rectangles seen from above; bands : (s, b, 2) heights of the lower and upper edges of b
-    rectangles above one another; passed : (s, b) int64, is added to.
+    rectangles above one another; passed : (s, p, b) int64, is added to in each of p equal parts along the rectangles.
     """
     for s in range(segments.shape[0]):
         ax, ay, bx, by = segments[s, 0], segments[s, 1], segments[s, 2], segments[s, 3]
@@ -208,8 +208,9 @@ def passing_lines(x, y, height, sensor_x, sensor_y, sensor_height, segments, ban
             if along < 0.0 or along > length:
                 continue
             crossing = sensor_height[i] + share * (height[i] - sensor_height[i])
+            part = min(int(along / length * passed.shape[1]), passed.shape[1] - 1)
             for b in range(bands.shape[1]):
-                passed[s, b] += bands[s, b, 0] <= crossing <= bands[s, b, 1]
+                passed[s, part, b] += bands[s, b, 0] <= crossing <= bands[s, b, 1]
 
 
 @kernel

@@ -17,9 +17,8 @@ from roadscan.assets.upright.pieces import seen_by
 from roadscan.compute.array_types import Float64
 from roadscan.compute.robust import SIGMA_OF_MAD
 
-STRETCHES: Final = (
-    "ground_m", "low_m", "high_m", "bulk_m", "length_m", "returns", "stopped", "passed", "under", "open_top", "leaves",
-)  # fmt: skip
+COUNTS: Final = ("returns", "stopped", "passed", "under", "foot", "cells", "open_cells", "leaves")
+STRETCHES: Final = ("ground_m", "low_m", "high_m", "bulk_m", "length_m", *COUNTS, "open_top")
 PIECE_SCHEMA: Final = pa.schema(
     [("x_m", pa.list_(pa.float64())), ("y_m", pa.list_(pa.float64()))]
     + [(name, pa.list_(pa.float64())) for name in STRETCHES]
@@ -41,6 +40,9 @@ _LOW_M: Final = 1.2
 _LEAST_LINES: Final = 15.0  # Fewer sight lines at a stretch do not tell whether it is porous.
 _MANY_PASSING: Final = 4.0  # So many lines that pass tell it, however few there are.
 _LEAST_PASSING: Final = 0.02  # Share of the sight lines that a porous stretch lets through.
+_SPARSER: Final = 1.0 / 3.0  # Below a free one stands so much less than above.
+_TELLING: Final = 5.0
+"""Lines that would have been stopped, so many that by chance all pass in 0.7 % of the cases."""
 _SHORTEST_M: Final = 0.02  # Shorter pieces and gaps are left out (m).
 
 
@@ -85,6 +87,14 @@ class Chain:
         passed, stopped = float(self.values["passed"].sum()), float(self.values["stopped"].sum())
         return passed / max(passed + stopped, 1.0)
 
+    def lets_more_through(self, share: float, sigmas: float) -> bool:
+        """Returns whether more than a share of the sight lines pass, by so many standard deviations of their number."""
+        passed, lines = (
+            float(self.values["passed"].sum()),
+            float((self.values["passed"] + self.values["stopped"]).sum()),
+        )
+        return passed > share * lines + sigmas * math.sqrt(share * (1.0 - share) * lines)
+
     @property
     def porous(self) -> float:
         """Returns the share of its length, where enough sight lines tell it, that lets some of them through.
@@ -111,6 +121,22 @@ class Chain:
         """Returns the share of the sight lines at it and below it that pass below it."""
         under, stopped = float(self.values["under"].sum()), float(self.values["stopped"].sum())
         return under / max(under + stopped, 1.0)
+
+    @property
+    def free_below(self) -> bool:
+        """Returns whether sight lines pass below it that it would have stopped, a third as dense as it is above."""
+        under, foot = float(self.values["under"].sum()), float(self.values["foot"].sum())
+        dense = 1.0 - self.passing
+        return under * dense >= _TELLING and foot < _SPARSER * dense * (under + foot)
+
+    @property
+    def openings(self) -> float:
+        """Returns the share of its cells, where enough sight lines tell it, that let some through; 1 of none.
+
+        What lets lines through everywhere is porous; a front does so at its doors and windows alone.
+        """
+        told = float(self.values["cells"].sum())
+        return float(self.values["open_cells"].sum()) / told if told else 1.0
 
     @property
     def open_top(self) -> float:
@@ -173,9 +199,7 @@ def _row(scene: Scene, panel: Panel, run: list[tuple[int, float, float]]) -> dic
         if rows.size
         else {"returns": 0, "passes": [], "first_epoch_gps_ns": None, "last_epoch_gps_ns": None}
     )
-    counts = {
-        name: getattr(panel, name)[numbers] * shares for name in ("returns", "stopped", "passed", "under", "leaves")
-    }
+    counts = {name: getattr(panel, name)[numbers] * shares for name in COUNTS}
     heights = {name: getattr(panel, name)[numbers] for name in ("ground_m", "low_m", "high_m", "bulk_m")}
     return {
         "x_m": (east + xy[:, 0]).tolist(), "y_m": (north + xy[:, 1]).tolist(),

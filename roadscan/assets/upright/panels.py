@@ -35,6 +35,8 @@ _MOST_MISSED: Final = 3  # … over so many that do not show it.
 _AROUND_M, _THIN_M, _SLICE_M = 0.45, 0.1, 0.1
 """Returns so near to a place and, on its line, so near to that tell of slices so high (m)."""
 _SLICES: Final = 15  # So many lie below the greatest height.
+_CLEARLY: Final = 3.0
+"""A surface ends where slices hold fewer returns than those below by so many standard deviations of a count."""
 _MOSTLY: Final = 0.7  # Share of the returns in front of and on the line that lie on it.
 _SHIFTS_M: Final = np.linspace(-0.2, 0.2, 11)  # The line may go on so far beside itself (m).
 _SPREAD_M: Final = 0.04  # Returns of a thin surface scatter no more across it (m).
@@ -45,6 +47,10 @@ _BESIDE_M: Final = 0.2
 """Returns of a region up to this distance beside its line (m) make the surface."""
 _RIM_M: Final = 0.08
 """Sight lines nearer than this to an edge of a surface (m) do not count."""
+_CELLS: Final = 4
+"""A stretch has so many cells along it, and above one another, …"""
+_FEWEST_LINES: Final = 8
+"""… each of which so many sight lines tell of: all end by chance on what lets a fifth through in 17 % of the cases."""
 _ABOVE_GROUND_M: Final = 0.12
 """Sight lines below this height above the ground (m) do not tell whether the space below a surface is free."""
 _OPEN_DEG: Final = 1.2  # The top of a surface is open within this angle of the highest beam (degrees).
@@ -74,6 +80,12 @@ class Panel:
     there, and `under` of those between the ground and its lower edge. Lines that end before it are in none."""
     passed: Int64
     under: Int64
+    foot: Int64
+    """(k,) sight lines of the sample that end on its place below its lower edge."""
+    cells: Int64
+    """(k,) quarters of its length and of its height that eight sight lines or more met; `open_cells` is the number of
+    those that let one through."""
+    open_cells: Int64
     open_top: npt.NDArray[np.bool_]
     """(k,) True where the highest laser still meets it: its top is not seen."""
     leaves: Int64
@@ -145,8 +157,8 @@ def _panel(scene: Scene, region: Region, highest_deg: float) -> Panel | None:
     leaves = np.bincount(stretch[np.isin(scene.classes[rows], _VEGETATION)], minlength=count)
     return Panel(
         xy, scene.ground.height_at(centre[:, 0], centre[:, 1]), low, high, bulk,
-        np.bincount(stretch, minlength=count), none, none, none, open_top, leaves, region.across_m, sensor, rows,
-        stretch,
+        np.bincount(stretch, minlength=count), none, none, none, none, none, none, open_top, leaves, region.across_m,
+        sensor, rows, stretch,
     )  # fmt: skip
 
 
@@ -201,7 +213,10 @@ def _on_line(scene: Scene, place: tuple[float, float], along: Float64, middle_m:
     in_front = ~on & ((d - shift) * before < 0.0)
     level = ((above - LOWEST_M) / _SLICE_M).astype(np.int64)
     mine, others = (np.bincount(level[some], minlength=_SLICES + 2) for some in (on, in_front))
-    good = (mine > 0) & (mine >= others)
+    usual = np.array([median(mine[: k + 1]) for k in range(_SLICES)])
+    fewest = np.maximum(usual - _CLEARLY * np.sqrt(usual), 0.0)
+    good = (mine[:_SLICES] > fewest) & (mine[:_SLICES] >= others[:_SLICES])
+    good = np.append(good, [False, False])
     ends = np.flatnonzero(~good[:-1] & ~good[1:])  # two slices above one another that show no surface
     top = int(ends[ends > np.argmax(good)][0]) if good.any() else 0
     on &= level < top
@@ -264,27 +279,70 @@ def _with_sight(scene: Scene, panels: list[Panel]) -> list[Panel]:
     taken = np.zeros(len(returns), np.bool_)
     taken[some] = True
     asked = [(p.high_m - p.ground_m <= _HIGH_M) & p.comes_near(scene.tile) for p in panels]
-
     lines = np.concatenate([np.zeros((0, 4)), *(
         np.column_stack([p.xy_m[:-1], p.xy_m[1:]])[low] for p, low in zip(panels, asked, strict=True)
     )])  # fmt: skip
-    bands = np.concatenate([np.zeros((0, 4)), *(
-        np.column_stack([p.low_m + _RIM_M, p.high_m - _RIM_M, p.ground_m + _ABOVE_GROUND_M, p.low_m - _RIM_M])[low]
-        for p, low in zip(panels, asked, strict=True)
-    )])  # fmt: skip
-    found = np.zeros((len(lines), 2), np.int64)
+    bands = np.concatenate([
+        np.zeros((0, _CELLS + 1, 2)), *(_bands(p)[low] for p, low in zip(panels, asked, strict=True)),
+    ])  # fmt: skip
+    found = np.zeros((len(lines), _CELLS, _CELLS + 1), np.int64)
     passing_lines(
         returns.x_m[some], returns.y_m[some], returns.height_m[some], returns.sensor_x_m[some],
-        returns.sensor_y_m[some], returns.sensor_height_m[some], lines, bands.reshape(-1, 2, 2), found,
+        returns.sensor_y_m[some], returns.sensor_height_m[some], lines, bands, found,
     )  # fmt: skip
     out, first = [], 0
     for p, low in zip(panels, asked, strict=True):
-        count, own = p.returns.size, slice(first, first + int(low.sum()))
-        height = returns.height_m[p.rows]
-        between = (height > p.low_m[p.stretch] + _RIM_M) & (height < p.high_m[p.stretch] - _RIM_M)
-        stopped = np.bincount(p.stretch[taken[p.rows] & between], minlength=count)
-        through = np.zeros((count, 2), np.int64)
+        own = slice(first, first + int(low.sum()))
+        through = np.zeros((p.returns.size, _CELLS, _CELLS + 1), np.int64)
         through[low] = found[own]
-        out.append(replace(p, stopped=stopped, passed=through[:, 0], under=through[:, 1]))
+        ends = _stopped(scene, p, taken[p.rows])
+        passed = through[..., :_CELLS]
+        told = low[:, None, None] & (passed + ends >= _FEWEST_LINES)
+        out.append(replace(
+            p, stopped=ends.sum(axis=(1, 2)), passed=passed.sum(axis=(1, 2)), under=through[..., _CELLS].sum(axis=1),
+            cells=told.sum(axis=(1, 2)), open_cells=(told & (passed > 0)).sum(axis=(1, 2)),
+            foot=_at_foot(scene, p, taken, low & (through[..., _CELLS].sum(axis=1) > 0)),
+        ))  # fmt: skip
         first = own.stop
     return out
+
+
+def _at_foot(scene: Scene, panel: Panel, taken: npt.NDArray[np.bool_], asked: npt.NDArray[np.bool_]) -> Int64:
+    """Returns how many sight lines (k,) of the sample end on the place of a surface below its lower edge."""
+    out, returns = np.zeros(panel.returns.size, np.int64), scene.returns
+    middle, way = (panel.xy_m[:-1] + panel.xy_m[1:]) / 2, np.diff(panel.xy_m, axis=0)
+    for k in np.flatnonzero(asked).tolist():
+        long = float(np.hypot(*way[k]))
+        rows = places_of(scene).within(float(middle[k, 0]), float(middle[k, 1]), long / 2 + _BESIDE_M)
+        rows = rows[taken[rows]]
+        t, d = np.empty(rows.size), np.empty(rows.size)
+        beside_line(returns.x_m, returns.y_m, rows, middle[k], way[k] / max(long, 1e-9), t, d)
+        height = returns.height_m[rows]
+        below = (height > panel.ground_m[k] + _ABOVE_GROUND_M) & (height < panel.low_m[k] - _RIM_M)
+        out[k] = np.count_nonzero(below & (np.abs(t) <= long / 2) & (np.abs(d) <= _BESIDE_M))
+    return out
+
+
+def _bands(panel: Panel) -> Float64:
+    """Returns the lower and upper edges (k, 5, 2) of the cells above one another, and those of what is below."""
+    share = np.arange(_CELLS + 1) / _CELLS
+    low, high = panel.low_m + _RIM_M, panel.high_m - _RIM_M
+    edge = low[:, None] + share * (high - low)[:, None]
+    below = np.stack([panel.ground_m + _ABOVE_GROUND_M, panel.low_m - _RIM_M], axis=1)
+    return np.concatenate([np.stack([edge[:, :-1], edge[:, 1:]], axis=2), below[:, None]], axis=1)
+
+
+def _stopped(scene: Scene, panel: Panel, taken: npt.NDArray[np.bool_]) -> Int64:
+    """Returns how many sight lines (k, 4, 4) of the sample end in each cell of its stretches."""
+    rows, stretch = panel.rows[taken], panel.stretch[taken]
+    way = np.diff(panel.xy_m, axis=0)
+    past = np.column_stack([scene.returns.x_m[rows], scene.returns.y_m[rows]]) - panel.xy_m[stretch]
+    along = (past * way[stretch]).sum(axis=1) / np.maximum((way * way).sum(axis=1), 1e-9)[stretch]
+    low, high = (panel.low_m + _RIM_M)[stretch], (panel.high_m - _RIM_M)[stretch]
+    height = scene.returns.height_m[rows]
+    between = (height > low) & (height < high)
+    level = (height - low)[between] / (high - low)[between]
+    column, row = ((share * _CELLS).astype(np.int64).clip(0, _CELLS - 1) for share in (along[between], level))
+    count = panel.returns.size * _CELLS * _CELLS
+    cell = (stretch[between].astype(np.int64) * _CELLS + column) * _CELLS + row
+    return np.bincount(cell, minlength=count).reshape(-1, _CELLS, _CELLS)

@@ -39,9 +39,9 @@ _LEAST_TOP_M: Final = 0.5  # Lower surfaces (m) are of no kind.
 _CHANGE_M: Final = 1.5  # A change of sort along a surface counts as so many metres of another sort.
 _MOST_VEGETATION: Final = 0.5  # Surfaces with a larger share of vegetation are hedges, …
 _THIN_M: Final = 0.035  # … unless they scatter less across their plane (m) …
-_MORE_THAN_LEAVES: Final = 0.4
-"""… or let a larger share of the sight lines pass. On sweeps 0–3 of the labelled street hedges scatter by 43 to 55 mm,
-and let 24 % pass at the most."""
+_MORE_THAN_LEAVES, _SURE = 0.4, 2.0
+"""… or let a larger share of the sight lines pass, by two standard deviations of their number. On sweeps 0–3 of the
+labelled street hedges scatter by 43 to 55 mm, and let 24 % pass at the most."""
 
 
 def told(chain: Chain) -> Surface | None:
@@ -54,16 +54,17 @@ def told(chain: Chain) -> Surface | None:
     top, low, bulk = chain.median("high_m"), chain.median("low_m"), chain.median("bulk_m")
     if not np.isfinite(top) or low > 2.0 or chain.length_m < 1.5:
         return None
-    if chain.vegetation > _MOST_VEGETATION and chain.across_m > _THIN_M and chain.passing < _MORE_THAN_LEAVES:
+    is_leafy = chain.vegetation > _MOST_VEGETATION and chain.across_m > _THIN_M
+    if is_leafy and not chain.lets_more_through(_MORE_THAN_LEAVES, _SURE):
         return None
     if top > _FACADE_M or (top > _OPEN_M and chain.open_top > 0.4):
         return "facade" if chain.passing < 0.4 and chain.length_m >= 2.0 else None
-    if low > 0.6 and (low > 1.2 or (chain.hovering > _HOVERS and chain.porous < _POROUS)):
+    if low > 0.6 and (low > 1.2 or chain.free_below or (chain.hovering > _HOVERS and chain.porous < _POROUS)):
         return None
     is_rail = bulk > 0.36 and 0.5 <= top <= 1.15 and top - bulk < 0.5 and chain.passing < _RAIL_PASSING
     if is_rail and chain.length_m >= 4.0:
         return "guardrail"
-    if chain.porous >= _POROUS and chain.passing >= _LEAST_PASSING:
+    if chain.porous >= _POROUS and chain.passing >= _LEAST_PASSING and chain.openings >= _POROUS:
         is_fence = top >= 0.6 and chain.length_m >= _LEAST_FENCE_M and chain.passing <= _MOST_PASSING
         return "fence" if is_fence else None
     if top > 1.25:

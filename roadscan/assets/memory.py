@@ -5,36 +5,33 @@ from __future__ import annotations
 import functools
 import weakref
 from collections.abc import Callable
-from typing import Concatenate, ParamSpec, TypeVar
+from typing import Any, TypeVar, cast
 
 from roadscan.assets.scene import Scene
 
-Found = TypeVar("Found")
-Options = ParamSpec("Options")
-
-_Find = Callable[Concatenate[Scene, Options], Found]
+Find = TypeVar("Find", bound=Callable[..., Any])
 
 
-def once_a_tile(find: _Find[Options, Found]) -> _Find[Options, Found]:
-    """Returns the same function, which processes a scene once while the scene is in memory."""
-    known: weakref.WeakKeyDictionary[Scene, dict[object, Found]] = weakref.WeakKeyDictionary()
+def once_a_tile(find: Find) -> Find:
+    """Returns the same function of a scene and options, which is computed once while the scene is in memory."""
+    known: weakref.WeakKeyDictionary[Scene, dict[object, Any]] = weakref.WeakKeyDictionary()
 
     @functools.wraps(find)
-    def remembered(scene: Scene, *options: Options.args, **named: Options.kwargs) -> Found:
+    def remembered(scene: Scene, *options: object) -> Any:
         found = known.setdefault(scene, {})
         if options not in found:
-            found[options] = find(scene, *options, **named)
+            found[options] = find(scene, *options)
         return found[options]
 
-    return remembered
+    return cast(Find, remembered)
 
 
-def once_a_scene(find: _Find[Options, Found]) -> _Find[Options, Found]:
-    """Returns the same function, which processes a scene of several tiles once, for all of them together."""
+def once_a_scene(find: Find) -> Find:
+    """Returns the same function, which is computed once for all tiles of a scene together."""
     remembered = once_a_tile(find)
 
     @functools.wraps(find)
-    def of_whole(scene: Scene, *options: Options.args, **named: Options.kwargs) -> Found:
-        return remembered(scene if scene.whole is None else scene.whole, *options, **named)
+    def of_whole(scene: Scene, *options: object) -> Any:
+        return remembered(scene if scene.whole is None else scene.whole, *options)
 
-    return of_whole
+    return cast(Find, of_whole)

@@ -35,9 +35,7 @@ class Cover(AssetKind):
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:
         """Returns spots that are probably a cover or a drain and whose middle lies in the tile."""
-        return Evidence(
-            pieces_of(scene, [_place(scene, *one) for one in _covers_of(scene)], self.piece_schema)
-        )
+        return Evidence(pieces_of(scene, [_place(scene, *one) for one in _covers_of(scene)], self.piece_schema))
 
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]

@@ -72,7 +72,7 @@ def search(plan: AssetPlan) -> tuple[dict[str, float], dict[str, list[pa.Table]]
     gains: pa.Table | None = None
     for squares in plan.blocks(list(plan.keys)):
         began = time.process_time()
-        for one in load_squares(plan.load(squares)):
+        for one in load_squares(plan.load(squares), list(dict.fromkeys(plan.together[s] for s in squares))):
             began = spent("loading", began)
             if not len(one.returns):
                 continue
@@ -82,9 +82,11 @@ def search(plan: AssetPlan) -> tuple[dict[str, float], dict[str, list[pa.Table]]
                 gains, began = gains_of([intensity_sample(scene)]), time.process_time()
             scene = calibrated_scene(scene, gains)
             began = spent("intensity", began)
-            for kind, options in kinds:
-                pieces.setdefault(kind.name, []).append(kind.evidence(scene, options).pieces)
-                began = spent(kind.name, began)
+            for square in one.squares:
+                own = scene.of_tile(plan.grid.box_from(one.returns.corner_m, square))
+                for kind, options in kinds:
+                    pieces.setdefault(kind.name, []).append(kind.evidence(own, options).pieces)
+                    began = spent(kind.name, began)
     return seconds, pieces
 
 

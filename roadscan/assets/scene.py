@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -95,6 +95,12 @@ class Scene:
     drive_xyh_m: Float64
     """(p, 4) the drives through the window: x, y, height of the sensor, and the pass, in the order of time."""
     statistics: Statistics = field(default_factory=Statistics)
+    whole: Scene | None = None
+    """The scene of several tiles together that this one is a view of, with its own tile; None: it is none."""
+
+    def of_tile(self, tile: Box) -> Scene:
+        """Returns the same scene for one of its tiles: what does not depend on the tile is computed once for all."""
+        return replace(self, tile=tile, whole=self)
 
     @cached_property
     def extent(self) -> Box:

@@ -41,6 +41,9 @@ class AssetsConfig(SurveySection):
     max_block_returns: int = Field(default=6_000_000, ge=1)
     """Squares that are expected to hold more returns together are not searched by one task; a worker needs about
     400 MB and 120 bytes a return. Changes no result."""
+    max_scene_returns: int = Field(default=6_000_000, ge=0)
+    """Up to four by four squares that are expected to hold no more returns together are searched in one scene, which
+    takes less time than one a square; 0: each in its own. Changes no result but what lies where scenes end."""
     intensity: Literal["calibrated", "raw"] = "calibrated"
     """Intensities that kinds look at: calibrated by gains for each laser, range and angle of incidence, which some
     squares tell (table `intensity_gains`), or as recorded. Classified points always hold recorded ones."""

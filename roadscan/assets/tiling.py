@@ -63,26 +63,31 @@ class AssetGrid:
         east, north = (math.floor(at / _ORIGINS_M) * _ORIGINS_M for at in self.corner_m(square))
         return east, north
 
-    def own_box(self, square: TileId) -> Box:
-        """Returns a square, from its origin."""
-        (east, north), (x, y) = self.corner_m(square), self.origin_m(square)
-        return Box(east - x, north - y, east - x + self.edge_m, north - y + self.edge_m)
+    def box_from(self, origin_m: tuple[float, float], *squares: TileId) -> Box:
+        """Returns the least box with some squares, from a place."""
+        east, north = zip(*map(self.corner_m, squares), strict=True)
+        x, y = origin_m
+        return Box(min(east) - x, min(north) - y, max(east) - x + self.edge_m, max(north) - y + self.edge_m)
 
-    def scene_box(self, square: TileId) -> Box:
-        """Returns the window in which kinds look for evidence, from the square's origin."""
-        return _around(self.own_box(square), self.halos.scene_m, _STEP_M)
+    def own_box(self, *squares: TileId) -> Box:
+        """Returns the least box with some squares, from the origin of the first."""
+        return self.box_from(self.origin_m(squares[0]), *squares)
 
-    def classes_box(self, square: TileId) -> Box:
-        """Returns the window in which returns are classified, from the square's origin."""
-        return _around(self.own_box(square), self.halos.classes_m, _STEP_M)
+    def scene_box(self, *squares: TileId) -> Box:
+        """Returns the window in which kinds look for evidence of some squares, from the origin of the first."""
+        return _around(self.own_box(*squares), self.halos.scene_m, _STEP_M)
 
-    def ground_box(self, square: TileId) -> Box:
-        """Returns the window whose returns tell of bare earth, from the square's origin."""
-        return _around(self.own_box(square), self.halos.ground_m, _GROUND_STEP_M)
+    def classes_box(self, *squares: TileId) -> Box:
+        """Returns the window in which returns are classified, from the origin of the first square."""
+        return _around(self.own_box(*squares), self.halos.classes_m, _STEP_M)
 
-    def window(self, square: TileId) -> Bounds:
-        """Returns the map (m) on which a square depends."""
-        (east, north), box = self.origin_m(square), self.ground_box(square)
+    def ground_box(self, *squares: TileId) -> Box:
+        """Returns the window whose returns tell of bare earth, from the origin of the first square."""
+        return _around(self.own_box(*squares), self.halos.ground_m, _GROUND_STEP_M)
+
+    def window(self, *squares: TileId) -> Bounds:
+        """Returns the map (m) on which some squares depend."""
+        (east, north), box = self.origin_m(squares[0]), self.ground_box(*squares)
         return Bounds(east + box.x_min_m, north + box.y_min_m, east + box.x_max_m, north + box.y_max_m)
 
     def tiles_under(self, square: TileId) -> list[TileId]:

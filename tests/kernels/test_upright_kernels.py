@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import ndimage
 
 from roadscan.assets.kernels.buckets import count_buckets, fill_buckets
 from roadscan.assets.kernels.corridors import mark_corridor
 from roadscan.assets.kernels.cylinders import fit_cylinder, radius_across
 from roadscan.assets.kernels.grown_cells import low_moments
-from roadscan.assets.kernels.slices import fill_slices, label_slices, owners, slices_above_one_another
+from roadscan.assets.kernels.slices import fill_slices, slices_above_one_another
 from roadscan.assets.kernels.upright_voxels import (
     beside_line,
     gather_moments,
@@ -22,7 +21,7 @@ from roadscan.assets.kernels.upright_voxels import (
 )
 
 
-def test_slices_and_their_components() -> None:
+def test_slices_count_returns() -> None:
     rng = np.random.default_rng(1)
     x, y, above = rng.uniform(0, 2, 300), rng.uniform(0, 2, 300), rng.uniform(-0.5, 1.5, 300)
     above[7] = np.nan
@@ -34,25 +33,6 @@ def test_slices_and_their_components() -> None:
         np.column_stack([above, y, x])[inside], bins=(3, 20, 20), range=((0.2, 1.4), (0, 2), (0, 2))
     )
     assert (counts == expected).all() and (np.flatnonzero(cell >= 0) == np.flatnonzero(inside)).all()
-    labels = np.zeros(counts.shape, np.int32)
-    most = int((counts > 0).sum())
-    boxes = np.empty((most, 5), np.int32)
-    found = label_slices(counts, np.flatnonzero(counts), labels, boxes, np.empty(most, np.int64))
-    flat = np.zeros((3, 3, 3), int)
-    flat[1] = 1
-    wanted, number = ndimage.label(counts > 0, structure=flat)
-    assert found == number and (labels == wanted).all()
-    for k, (level, rows, columns) in enumerate(ndimage.find_objects(wanted)):
-        assert boxes[k].tolist() == [level.start, rows.start, rows.stop - 1, columns.start, columns.stop - 1]
-    # Every other component is one that returns may belong to.
-    number_of = np.full(found + 1, -1, np.int32)
-    number_of[1::2] = np.arange(number_of[1::2].size)
-    owner, sums = np.empty(300, np.int32), np.zeros((number_of[1::2].size, 3))
-    owners(x, y, cell, labels.reshape(-1), number_of, owner, sums)
-    own = np.where(cell >= 0, number_of[labels.ravel()[cell]], -1)
-    assert (owner == own).all()
-    assert (sums[:, 0] == np.bincount(own[own >= 0], minlength=len(sums))).all()
-    assert (sums[:, 1] == np.bincount(own[own >= 0], x[own >= 0], minlength=len(sums))).all()
 
 
 def test_slices_above_one_another() -> None:

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from roadscan.assets import classes
 from roadscan.assets.bins import cells_of, in_bins
 from roadscan.assets.covers.kernels.grown import grow_spot
+from roadscan.assets.memory import once_a_scene
 from roadscan.assets.paint.contrast import Contrast
 from roadscan.assets.paint.detection import paint_of
 from roadscan.assets.quantiles import median
@@ -92,6 +93,7 @@ class Ground:
 _Buckets = tuple[tuple[Int64, Int64], tuple[float, float, float, int, int]]
 
 
+@once_a_scene
 def spots_of(scene: Scene) -> list[Spot]:
     """Returns the spots whose middle lies in the scene's tile, by their place."""
     contrast = paint_of(scene).contrast

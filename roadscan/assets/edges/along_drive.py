@@ -15,7 +15,7 @@ from roadscan.assets.edges.free import free_edges
 from roadscan.assets.edges.line_pieces import NODE_COLUMNS, CutEdge, columns_of, cut_at, dense
 from roadscan.assets.edges.profiles import smooth_line
 from roadscan.assets.edges.raster import HeightRaster, raster_of
-from roadscan.assets.memory import once_a_scene
+from roadscan.assets.memory import once_a_scene, once_a_tile
 from roadscan.assets.scene import Scene
 from roadscan.compute.array_types import Float64
 from roadscan.compute.edges.across import edge_along
@@ -73,20 +73,25 @@ def _stations(part: Float64, earlier: Float64) -> Iterator[Track]:
             yield Track(places[rows], heading[rows])
 
 
-@once_a_scene
+@once_a_tile
 def road_edges(scene: Scene) -> list[CutEdge]:
     """Edges beside the drives within the scene's tile: nodes (n, `EDGE_COLUMNS`) in the direction of the drive."""
+    return [part for nodes in _edges_of_drives(scene) for part in cut_at(nodes, scene.tile)]
+
+
+@once_a_scene
+def _edges_of_drives(scene: Scene) -> list[Float64]:
+    """Returns the same of the whole scene."""
     raster = raster_of(scene)
     if len(scene.drive_xyh_m) < 2 or not (raster.count > 0).any():
         return []
     kerbs = [columns_of(edge) for edge in free_edges(scene)]
     beside = beside_of(scene)
-    parts: list[CutEdge] = []
+    found: list[Float64] = []
     for track in tracks_of(scene.drive_xyh_m):
         for right in (False, True):
-            for nodes in _one_side(track, right, raster, beside, kerbs):
-                parts += cut_at(nodes, scene.tile)
-    return parts
+            found += _one_side(track, right, raster, beside, kerbs)
+    return found
 
 
 def _one_side(

@@ -13,7 +13,7 @@ from roadscan.assets.edges.free import free_edges
 from roadscan.assets.edges.line_pieces import NODE_COLUMNS, columns_of, cut_at, dense, line_schema, pieces_table
 from roadscan.assets.edges.raster import HeightRaster, raster_of
 from roadscan.assets.kernels import transects as kernel
-from roadscan.assets.memory import once_a_scene
+from roadscan.assets.memory import once_a_scene, once_a_tile
 from roadscan.assets.scene import Scene
 from roadscan.assets.smoothing import gaussian
 from roadscan.compute.array_types import Float64
@@ -44,17 +44,17 @@ class Beside(NamedTuple):
     edge_y: Float64
 
 
-@once_a_scene
+@once_a_tile
 def pieces_beside(scene: Scene) -> pa.Table:
     """Returns rows of `BESIDE_PIECES`: the scene's edges within its tile with the surface on their higher side."""
+    parts = [part for nodes in _edges_with_transects(scene) for part in cut_at(nodes, scene.tile)]
+    return pieces_table(parts, scene, raster_of(scene), BESIDE_PIECES)
+
+
+@once_a_scene
+def _edges_with_transects(scene: Scene) -> list[Float64]:
     raster, edges = raster_of(scene), free_edges(scene)
-    parts = []
-    if edges:
-        beside = beside_of(scene)
-        parts = [
-            part for edge in edges for part in cut_at(_with_transects(columns_of(edge), beside, raster), scene.tile)
-        ]
-    return pieces_table(parts, scene, raster, BESIDE_PIECES)
+    return [_with_transects(columns_of(edge), beside_of(scene), raster) for edge in edges]
 
 
 @once_a_scene

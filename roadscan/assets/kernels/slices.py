@@ -1,4 +1,4 @@
-"""Horizontal slices of the returns above the ground: occupied cells, and connected components of a slice."""
+"""Horizontal slices of the returns above the ground: occupied cells, and slices above one another."""
 
 from __future__ import annotations
 
@@ -27,64 +27,6 @@ def fill_slices(x, y, above, corner, cell_m, slice_m, counts, cell_of):
         if counts[k, r, c] < 65535:
             counts[k, r, c] += 1
         cell_of[i] = (k * rows + r) * columns + c
-
-
-@kernel
-def label_slices(counts, cells, labels, boxes, stack):
-    """Label the components of all slices, cells that touch, also at corners, within a slice; returns their number.
-
-    cells : (m,) int64 flat numbers of the cells with returns, ascending; labels : (slices, rows, columns) int32,
-    zeroed; gets the component's number from 1; boxes : (m, 5) int32, gets slice, first and last row, first and last
-    column; stack : (m,) int64, working space.
-    """
-    _, rows, columns = counts.shape
-    found, line, k, r = 0, 0, 0, 0
-    for cell in cells:
-        while cell - line >= columns:
-            line += columns
-            r += 1
-            if r == rows:
-                k, r = k + 1, 0
-        c = cell - line
-        if labels[k, r, c] != 0:
-            continue
-        found += 1
-        labels[k, r, c] = found
-        stack[0] = r << 32 | c
-        waiting = 1
-        south, north, west, east = r, r, c, c
-        while waiting > 0:
-            waiting -= 1
-            at = stack[waiting]
-            row, column = at >> 32, at & 0xFFFFFFFF
-            south, north = min(south, row), max(north, row)
-            west, east = min(west, column), max(east, column)
-            for rr in range(max(row - 1, 0), min(row + 2, rows)):
-                for cc in range(max(column - 1, 0), min(column + 2, columns)):
-                    if counts[k, rr, cc] != 0 and labels[k, rr, cc] == 0:
-                        labels[k, rr, cc] = found
-                        stack[waiting] = rr << 32 | cc
-                        waiting += 1
-        boxes[found - 1, 0] = k
-        boxes[found - 1, 1], boxes[found - 1, 2] = south, north
-        boxes[found - 1, 3], boxes[found - 1, 4] = west, east
-    return found
-
-
-@kernel
-def owners(x, y, cell, labels, number, owner, sums):
-    """Fill `owner` (n,) int32, the component of each return, −1 of none, and add up those of each component.
-
-    x, y : (n,) places (m); cell : (n,) as :func:`fill_slices` notes it; labels : (cells,) as :func:`label_slices` fills
-    them; number : (labels + 1,) int32, component that a label stands for, −1 of none; sums : (components, 3) float64,
-    added to: number, x and y.
-    """
-    for i in range(cell.size):
-        owner[i] = number[labels[cell[i]]] if cell[i] >= 0 else -1
-        if owner[i] >= 0:
-            sums[owner[i], 0] += 1.0
-            sums[owner[i], 1] += x[i]
-            sums[owner[i], 2] += y[i]
 
 
 @kernel

@@ -10,6 +10,7 @@ import pyarrow as pa
 from roadscan.assets.covers.spots import Spot, spots_of
 from roadscan.assets.judgement.judge import Judge
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence
+from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.pieces import Place, objects_at_places, pieces_of, schema_of
 
@@ -34,15 +35,18 @@ class Cover(AssetKind):
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:
         """Returns spots that are probably a cover or a drain and whose middle lies in the tile."""
-        return Evidence(
-            pieces_of(scene, [_place(scene, *one) for one in told_apart(spots_of(scene))], self.piece_schema)
-        )
+        return Evidence(pieces_of(scene, [_place(scene, *one) for one in _covers_of(scene)], self.piece_schema))
 
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
     ) -> Iterable[AssetObject]:
         """Returns an object for each spot."""
         return objects_at_places(pieces, _APART_M)
+
+
+@once_a_scene
+def _covers_of(scene: Scene) -> list[tuple[Spot, str, float]]:
+    return told_apart(spots_of(scene))
 
 
 def told_apart(spots: list[Spot]) -> list[tuple[Spot, str, float]]:

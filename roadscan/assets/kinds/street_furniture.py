@@ -12,6 +12,7 @@ from roadscan.assets import classes
 from roadscan.assets.furniture.compact import Compact, compact_things
 from roadscan.assets.judgement.judge import Judge
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
+from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.pieces import Place, objects_at_places, pieces_of, schema_of
 
@@ -42,7 +43,7 @@ class StreetFurniture(AssetKind):
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:
         """Returns what is probably furniture and whose middle lies in the tile."""
-        told = told_apart(compact_things(scene))
+        told = _furniture_of(scene)
         pieces = pieces_of(scene, [_place(scene, *one) for one in told], self.piece_schema)
         return Evidence(pieces, tuple(Marked(thing.rows, classes.FURNITURE) for thing, _, _ in told))
 
@@ -51,6 +52,11 @@ class StreetFurniture(AssetKind):
     ) -> Iterable[AssetObject]:
         """Returns an object for each thing."""
         return objects_at_places(pieces, _APART_M)
+
+
+@once_a_scene
+def _furniture_of(scene: Scene) -> list[tuple[Compact, str, float]]:
+    return told_apart(compact_things(scene))
 
 
 def told_apart(things: list[Compact]) -> list[tuple[Compact, str, float]]:

@@ -13,9 +13,11 @@ import shapely
 from roadscan.assets import classes
 from roadscan.assets.judgement.judge import Judge
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
+from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
 from roadscan.assets.wires.spans import Span, features_of, spans_of
 from roadscan.assets.wires.thin import PIECE_SCHEMA, thin_cubes
+from roadscan.compute.array_types import Int64
 
 JUDGE: Final = Judge("wire", "58f4c2a3f7c55a32")
 """Who is asked whether a span is a wire."""
@@ -36,9 +38,7 @@ class Wire(AssetKind):
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:
         """Returns cubes of the tile that lie on a straight level line in the air."""
-        pieces, held = thin_cubes(scene)
-        marked = [held[k] for span, _ in judged(pieces) for k in span.rows.tolist()]
-        rows = np.concatenate(marked) if marked else np.empty(0, np.int64)
+        pieces, rows = _cubes_of(scene)
         east, north = scene.returns.corner_m
         own = scene.tile.holds(np.asarray(pieces["easting_m"]) - east, np.asarray(pieces["northing_m"]) - north)
         return Evidence(pieces.filter(pa.array(own)), (Marked(rows, classes.WIRE),))
@@ -49,6 +49,14 @@ class Wire(AssetKind):
         """Yields a line for each span, by its first place."""
         found = [_object(pieces, *one) for one in judged(pieces)]
         yield from sorted(found, key=lambda one: one.geometry.coords[0])
+
+
+@once_a_scene
+def _cubes_of(scene: Scene) -> tuple[pa.Table, Int64]:
+    """Returns the cubes of a scene that lie on a line, and the returns of wires."""
+    pieces, held = thin_cubes(scene)
+    marked = [held[k] for span, _ in judged(pieces) for k in span.rows.tolist()]
+    return pieces, np.concatenate(marked) if marked else np.empty(0, np.int64)
 
 
 def judged(pieces: pa.Table) -> list[tuple[Span, float]]:

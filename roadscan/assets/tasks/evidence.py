@@ -74,6 +74,8 @@ class EvidenceTask:
 
     load: ReturnsTask
     work: tuple[SquareWork, ...]
+    together: tuple[tuple[TileId, ...], ...]
+    """Its squares by scene; those of a scene that are not due are loaded with them."""
     kinds: tuple[tuple[str, Strict], ...]
     """All kinds of the survey with their settings: the classes of points come from all of them."""
     ground: GroundSettings
@@ -84,7 +86,7 @@ class EvidenceTask:
     @property
     def block(self) -> Block:
         """Returns the squares."""
-        return Block(self.load.squares)
+        return Block(tuple(one.square for one in self.work))
 
     @property
     def store(self) -> Store:
@@ -123,7 +125,12 @@ def evidence_tasks(
     plan: AssetPlan, due: Sequence[SquareWork], shared: Shared | None, workers: int = 1
 ) -> list[EvidenceTask]:
     """Returns tasks over the squares of which anything is due."""
-    return [_task(plan, due, shared, squares) for squares in plan.blocks([one.square for one in due], workers)]
+    blocks: dict[int, list[TileId]] = {}
+    number = {one: k for k, block in enumerate(plan.blocks([one.square for one in due], workers)) for one in block}
+    first = {plan.together[square]: k for square, k in reversed(number.items())}
+    for one in due:  # what one scene holds is searched by one task
+        blocks.setdefault(first[plan.together[one.square]], []).append(one.square)
+    return [_task(plan, due, shared, tuple(squares)) for _, squares in sorted(blocks.items())]
 
 
 def singly(
@@ -137,8 +144,10 @@ def _task(
     plan: AssetPlan, due: Sequence[SquareWork], shared: Shared | None, squares: tuple[TileId, ...]
 ) -> EvidenceTask:
     chosen = set(squares)
+    together = tuple(dict.fromkeys(plan.together[square] for square in squares))
     return EvidenceTask(
-        plan.load(squares), tuple(one for one in due if one.square in chosen),
+        plan.load(tuple(square for one in together for square in one)),
+        tuple(one for one in due if one.square in chosen), together,
         tuple((one.name, one.options) for one in plan.kinds), plan.config.ground, shared, plan.context,
     )  # fmt: skip
 
@@ -148,40 +157,49 @@ def find_evidence(task: EvidenceTask) -> TaskResult:
     records: list[OutputRecord] = []
     failures: list[tuple[str, str]] = []
     due = {one.square: one for one in task.work}
-    store, search = task.store, None
+    store, grid = task.store, task.load.grid
     gains = None if task.shared is None else task.shared.read_gains(store)
     statistics = Statistics() if task.shared is None else task.shared.read_statistics(store)
     with store.scratch() as folder:
-        for loaded in load_squares(task.load):
-            work = due[loaded.square]
+        for loaded in load_squares(task.load, task.together):
+            own = [due[square] for square in loaded.squares if square in due]
             try:
-                search = _Search(task, work, loaded, folder, (gains, statistics))
-                records += search.records()
-                failures += search.failures
-            except Exception as error:  # noqa: BLE001  one square's fault must not stop the others
-                failures.append((str(work.square), reason_of(error)))
-            search = loaded = None  # type: ignore[assignment]  # noqa: PLW2901  frees the memory for the next square
+                scenes = _scenes(task, loaded, gains, statistics) if len(loaded.returns) else None
+            except Exception as error:  # noqa: BLE001  a scene's fault must not stop the others
+                failures += [(str(work.square), reason_of(error)) for work in own]
+                continue
+            origin_m = loaded.returns.corner_m
+            loaded = None  # type: ignore[assignment]  # noqa: PLW2901  frees its memory
+            for work in own:
+                search = _Search(task, work, folder)
+                try:
+                    if scenes is None:
+                        records += search.nothing()
+                    else:
+                        tile = grid.box_from(origin_m, work.square)
+                        records += search.records(*(scene.of_tile(tile) for scene in scenes))
+                    failures += search.failures
+                except Exception as error:  # noqa: BLE001  one square's fault must not stop the others
+                    failures.append((str(work.square), reason_of(error)))
+            scenes = None
     return TaskResult.of(records, failures)
 
 
-class _Search:
-    """One square during its search, from returns to files."""
+def _scenes(task: EvidenceTask, loaded: LoadedSquare, gains: pa.Table | None, statistics: Statistics) -> list[Scene]:
+    """Returns the scene of squares with recorded intensities, and with those that kinds look at."""
+    scene = scene_of(task.load.grid, loaded, task.ground, statistics)
+    return [scene, scene if gains is None else calibrated_scene(scene, gains)]
 
-    def __init__(
-        self, task: EvidenceTask, work: SquareWork, loaded: LoadedSquare, folder: Path,
-        shared: tuple[pa.Table | None, Statistics],
-    ) -> None:  # fmt: skip
-        self._task, self._work, self._loaded, self._folder = task, work, loaded, folder
-        self._gains, self._statistics = shared
+
+class _Search:
+    """One square during its search, from its scene to files."""
+
+    def __init__(self, task: EvidenceTask, work: SquareWork, folder: Path) -> None:
+        self._task, self._work, self._folder = task, work, folder
         self.failures: list[tuple[str, str]] = []
 
-    def records(self) -> Iterator[OutputRecord]:
-        """Write what is due, kind by kind."""
-        if not len(self._loaded.returns):
-            yield from self._nothing()
-            return
-        scene = scene_of(self._task.load.grid, self._loaded, self._task.ground, self._statistics)
-        seen = scene if self._gains is None else calibrated_scene(scene, self._gains)
+    def records(self, scene: Scene, seen: Scene) -> Iterator[OutputRecord]:
+        """Write what is due, kind by kind; `seen` has the intensities that kinds look at."""
         keys = dict(self._work.kinds)
         marked: list[Marked] = []
         for name, options in self._task.kinds:
@@ -202,7 +220,7 @@ class _Search:
         if CLASSIFIED in self._work.beside and not self.failures:
             yield self._write_classified(scene, marked, self._work.beside[CLASSIFIED])
 
-    def _nothing(self) -> Iterator[OutputRecord]:
+    def nothing(self) -> Iterator[OutputRecord]:
         """Yields records of a square without returns: finished, and no file."""
         for name, key in self._work.kinds:
             yield OutputRecord(EVIDENCE, evidence_unit(name, self._work.square), key, "", 0, "", _told(0))
@@ -226,13 +244,13 @@ class _Search:
         return publish_file(self._task.store, path, target, product, unit, key, told)
 
     def _write_bare_earth(self, scene: Scene, key: str) -> OutputRecord:
-        grid, square = self._task.load.grid, self._work.square
-        model = within(scene.ground, grid.own_box(square))
+        square = self._work.square
+        model = within(scene.ground, scene.tile)
         known = 0 if model is None else int(np.count_nonzero(~np.isnan(model.height_m)))
         if model is None or not known:
             return OutputRecord(BARE_EARTH, str(square), key, "", 0, "", _told(0))
         path = self._folder / "bare_earth.tif"
-        write_bare_earth(path, model, grid.origin_m(square), self._task.context)
+        write_bare_earth(path, model, scene.returns.corner_m, self._task.context)
         detail = json.dumps({"cells": known, "seen": int(np.count_nonzero(model.seen))})
         target = f"products/{BARE_EARTH}/{square}.tif"
         return publish_file(self._task.store, path, target, BARE_EARTH, str(square), key, detail)

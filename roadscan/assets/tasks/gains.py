@@ -130,14 +130,14 @@ def find_samples(task: SampleTask) -> TaskResult:
     keys = dict(zip(task.load.squares, task.keys, strict=True))
     for loaded in load_squares(task.load):
         try:
-            records.append(_sampled(task, loaded, keys[loaded.square]))
+            records.append(_sampled(task, loaded, keys[loaded.squares[0]]))
         except Exception as error:  # noqa: BLE001  one square's fault must not stop the others
-            failures.append((f"{SAMPLES}/{loaded.square}", reason_of(error)))
+            failures.append((f"{SAMPLES}/{loaded.squares[0]}", reason_of(error)))
     return TaskResult.of(records, failures)
 
 
 def _sampled(task: SampleTask, loaded: LoadedSquare, key: str) -> OutputRecord:
-    unit = str(loaded.square)
+    unit = str(loaded.squares[0])
     if not len(loaded.returns):
         return OutputRecord(SAMPLES, unit, key, "", 0, "")
     scene = scene_of(task.load.grid, loaded, task.ground, Statistics())

@@ -53,29 +53,29 @@ class ReturnsTask:
 
 @dataclass(frozen=True, eq=False)
 class LoadedSquare:
-    """What was seen in a square and its halos."""
+    """What was seen in a square, or in some together, and in their halos."""
 
-    square: TileId
+    squares: tuple[TileId, ...]
     returns: Returns
     """Those of the window of the ground."""
     drive_xyh_m: Float64
     """(p, 4) drives through the window of its classes, as :class:`roadscan.assets.scene.Scene` has them."""
 
 
-def load_squares(task: ReturnsTask) -> Iterator[LoadedSquare]:
-    """Yields returns of each square, in the order of the task; one without any comes with none."""
+def load_squares(task: ReturnsTask, together: Sequence[tuple[TileId, ...]] = ()) -> Iterator[LoadedSquare]:
+    """Yields returns of squares together, or of each square in the order of the task; ones without any with none."""
     block = _Block(task)
-    for square in task.squares:
-        yield block.square(square)
+    for squares in together or [(square,) for square in task.squares]:
+        yield block.squares(squares)
 
 
 def scene_of(grid: AssetGrid, loaded: LoadedSquare, ground: GroundSettings, statistics: Statistics) -> Scene:
-    """Returns the scene of a square."""
-    square, drive = loaded.square, loaded.drive_xyh_m
+    """Returns the scene of a square, or of squares together."""
+    squares, drive = loaded.squares, loaded.drive_xyh_m
     own, window, around = (
-        grid.own_box(square),
-        grid.scene_box(square),
-        (grid.classes_box(square), grid.ground_box(square)),
+        grid.own_box(*squares),
+        grid.scene_box(*squares),
+        (grid.classes_box(*squares), grid.ground_box(*squares)),
     )
     return make_scene(loaded.returns, own, window, drive, ground, around, statistics)
 
@@ -116,18 +116,18 @@ class _Block:
         self._columns = in_order(_joined(parts))
         self._trajectories = [self._trajectory(source) for source in self._sources]
 
-    def square(self, square: TileId) -> LoadedSquare:
-        """Returns the returns of a square and its halos, and the drives through it."""
+    def squares(self, squares: tuple[TileId, ...]) -> LoadedSquare:
+        """Returns the returns of squares and their halos, and the drives through them."""
         grid, size = self._task.grid, self._ground.grid.size_quanta
-        corner = grid.origin_m(square)
+        corner = grid.origin_m(squares[0])
         west, south = (round(at * QUANTA_PER_M) - first * size for at, first in zip(corner, self._corner, strict=True))
         c = self._columns
-        ends = np.array([west, south, west, south]) + np.round(np.array(grid.ground_box(square)) * QUANTA_PER_M)
+        ends = np.array([west, south, west, south]) + np.round(np.array(grid.ground_box(*squares)) * QUANTA_PER_M)
         rows = np.empty(c.x.size, np.int64)
         rows = rows[: rows_within(c.x, c.y, ends.astype(np.int64), rows)]
         x, y = _metres(c.x[rows] - np.int32(west)), _metres(c.y[rows] - np.int32(south))
         if self._centre is not None:
-            w = grid.window(square)
+            w = grid.window(*squares)
             box = (w.easting_min_m, w.northing_min_m, w.easting_max_m, w.northing_max_m)
             near = self._centre.keeps(corner[0] + x, corner[1] + y, box)
             rows, x, y = rows[near], x[near], y[near]
@@ -152,7 +152,7 @@ class _Block:
             sensors=self._task.sensors,
             divergence_deg=self._task.divergence_deg,
         )
-        return LoadedSquare(square, returns, self._drives(own, square))
+        return LoadedSquare(squares, returns, self._drives(own, squares))
 
     @property
     def _sensor_of_source(self) -> npt.NDArray[np.uint8]:
@@ -225,7 +225,7 @@ class _Block:
         mountings = Mountings.one(UNMOUNTED) if source.table == "cloud" else source.adjusted_mountings
         return sensor_places(trajectory, self._ground.map, mountings, epochs_gps_ns)
 
-    def _drives(self, own: _Columns, square: TileId) -> Float64:
+    def _drives(self, own: _Columns, squares: tuple[TileId, ...]) -> Float64:
         """Places (p, 4) of the first sensor of each pass within the window while it looked there, and the pass."""
         grid = self._task.grid
         found = [np.zeros((0, 4))]
@@ -239,8 +239,8 @@ class _Block:
                 epochs = own.epoch_gps_ns[rows]
                 tick = distinct_steps(epochs if len(held) == 1 else epochs[ids == one], _DRIVE_TICK_NS)
                 places = self._places(number, tick * _DRIVE_TICK_NS + _DRIVE_TICK_NS // 2)
-                places[:, :2] -= grid.origin_m(square)
-                places = places[grid.classes_box(square).holds(places[:, 0], places[:, 1])]
+                places[:, :2] -= grid.origin_m(squares[0])
+                places = places[grid.classes_box(*squares).holds(places[:, 0], places[:, 1])]
                 if len(places):
                     seen.add(one)
                     found.append(np.column_stack([thinned(places), np.full(len(thinned(places)), float(one))]))

@@ -31,6 +31,8 @@ from roadscan.tiles.product import ProductContext
 from roadscan.tiles.tasks.tile_plan import PlannedTiles, TilePlan, plan_tiles
 from roadscan.tiles.tasks.wanted_products import product_context
 
+_SCENE_SQUARES: Final = 4
+"""Edge of the largest block of squares that are searched in one scene."""
 _BLOCK_SQUARES: Final = 16
 """Edge of the largest block of squares of one task: a lidar sees 100 m to both sides, and row groups that
 touch several blocks are read for each."""
@@ -54,6 +56,8 @@ class AssetPlan:
     """Key of what was seen in each square, by row and column."""
     readings: Mapping[TileId, int]
     """Approximate number of returns in each square."""
+    together: Mapping[TileId, tuple[TileId, ...]]
+    """The squares of one scene, by each of them."""
 
     @property
     def context(self) -> ProductContext:
@@ -88,7 +92,8 @@ class AssetPlan:
     def near(self, chosen: Sequence[TileId]) -> set[TileId]:
         """Returns squares that see one of some of the survey's tiles, in themselves or in their halo."""
         near = set(chosen)
-        return {square for square in self.keys if not near.isdisjoint(self.grid.tiles_under(square))}
+        found = {square for square in self.keys if not near.isdisjoint(self.grid.tiles_under(square))}
+        return {square for one in found for square in self.together[one]}
 
 
 def cut_squares(readings: Mapping[TileId, int], edge: int, max_readings: int) -> list[tuple[TileId, ...]]:
@@ -127,8 +132,13 @@ def plan_assets(plan: SurveyPlan, footprints: FootprintRanges) -> AssetPlan:
     tiles = plan_tiles(own, replace(plan, tile_key=common))
     held = TilePlan(plan, own, tiles, (), product_context(plan))
     readings = readings_of(grid, tiles)
-    keys = {square: square_key(common, grid, square, tiles) for square in readings}
-    return AssetPlan(plan, config, grid, held, tuple(chosen), ways, wanted_kinds(config), common, keys, readings)
+    own_keys = {square: square_key(common, grid, square, tiles) for square in readings}
+    scenes = cut_squares(readings, _SCENE_SQUARES, config.max_scene_returns)
+    together = {square: squares for squares in scenes for square in squares}
+    keys = {square: key_of([own_keys[one] for one in together[square]]) for square in readings}
+    return AssetPlan(
+        plan, config, grid, held, tuple(chosen), ways, wanted_kinds(config), common, keys, readings, together
+    )
 
 
 def readings_of(grid: AssetGrid, tiles: PlannedTiles) -> dict[TileId, int]:

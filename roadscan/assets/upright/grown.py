@@ -34,6 +34,8 @@ _LONG_M: Final = 2.0
 """Upright surfaces longer than this (m) are rails, fences and walls."""
 _WIDE: Final = np.ones((7, 7), np.uint8)
 """Walls, rails, kerbs and fences, with a cell to each side, are narrower than this (cells)."""
+_MARGIN_M: Final = 15.0
+"""Cells are judged so far beyond a tile (m): openings and pools reach three metres."""
 _POOLED: Final = np.ones((3, 3), np.uint8)
 """A cell is judged with those around it, which widens areas by one."""
 PIECE_SCHEMA: Final = pa.schema(
@@ -61,7 +63,7 @@ def grown_cells(scene: Scene, options: LandscapeOptions) -> pa.Table:
     Long upright surfaces are excluded, and an opening removes narrow areas.
     """
     tile, window = scene.tile, scene.window
-    margin = int((tile.x_min_m - window.x_min_m) / CELL_M)
+    margin = int(min(tile.x_min_m - window.x_min_m, _MARGIN_M) / CELL_M)
     corner = np.array([tile.x_min_m, tile.y_min_m]) - margin * CELL_M
     inner = tuple(round((high - low) / CELL_M) for low, high in
                   ((tile.y_min_m, tile.y_max_m), (tile.x_min_m, tile.x_max_m)))  # fmt: skip

@@ -17,6 +17,7 @@ from pydantic import Field
 
 from roadscan.assets.judgement.judge import Judge
 from roadscan.assets.kind import KindOptions
+from roadscan.assets.memory import once_a_scene
 from roadscan.assets.quantiles import median, quantiles
 from roadscan.assets.scene import Scene
 from roadscan.assets.touching import touching
@@ -106,6 +107,7 @@ class Plate:
     """NaN: not yet judged."""
 
 
+@once_a_scene
 def plates_of(scene: Scene, options: SignOptions) -> list[Plate]:
     """Returns plates of which the scene's tile may contain a part, by their place."""
     found = candidates_of(scene, options)

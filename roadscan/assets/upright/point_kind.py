@@ -26,7 +26,8 @@ class ShaftKind(AssetKind):
     def evidence(self, scene: Scene, options: Any) -> Evidence:
         """Returns shafts of this kind whose foot lies in the tile."""
         own = [u for u in uprights_of(scene) if u.kind == self.name]
-        pieces = pieces_of(scene, [_place(scene, u) for u in own], self.piece_schema)
+        here = [u for u in own if bool(scene.tile.holds(*u.shaft.foot_xy_m))]
+        pieces = pieces_of(scene, [_place(scene, u) for u in here], self.piece_schema)
         return Evidence(pieces, tuple(Marked(rows, code) for u in own for rows, code in self.marks(scene, u)))
 
     def marks(self, scene: Scene, upright: Upright) -> Iterable[tuple[Any, int]]:

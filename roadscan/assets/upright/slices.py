@@ -10,9 +10,10 @@ import numpy.typing as npt
 
 from roadscan.assets import classes
 from roadscan.assets.bins import in_bins
-from roadscan.assets.kernels.slices import fill_slices, label_slices, owners
+from roadscan.assets.kernels.slices import fill_slices
 from roadscan.assets.memory import once_a_scene
 from roadscan.assets.scene import Scene
+from roadscan.assets.touching import touching
 from roadscan.compute.array_types import Float64, Int64
 
 CELL_M: Final = 0.1  # Edge of a cell (m).
@@ -76,26 +77,23 @@ def slices_of(scene: Scene) -> Slices:
     cell = np.empty(len(returns), np.int64)
     corner = np.array([window.x_min_m, window.y_min_m, LOWEST_M])
     fill_slices(returns.x_m, returns.y_m, usable_above_m(scene), corner, CELL_M, SLICE_M, counts, cell)
-    cells = _not_zero(counts.reshape(-1))
-    labels, boxes = np.zeros(counts.shape, np.int32), np.empty((cells.size, 5), np.int32)
-    found = label_slices(counts, cells, labels, boxes, np.empty(max(cells.size, 1), np.int64))
-    boxes = boxes[:found]
-    widest = round(WIDEST_M / CELL_M)
-    compact = (boxes[:, 2] - boxes[:, 1] < widest) & (boxes[:, 4] - boxes[:, 3] < widest)
-    number = np.full(found + 1, -1, np.int32)
-    number[1:][compact] = np.arange(int(compact.sum()), dtype=np.int32)
-    owner, sums = np.empty(len(returns), np.int32), np.zeros((int(compact.sum()), 3))
-    owners(returns.x_m, returns.y_m, cell, labels.reshape(-1), number, owner, sums)
-    x, y = sums[:, 1] / sums[:, 0], sums[:, 2] / sums[:, 0]
-    return Slices((window.x_min_m, window.y_min_m), counts, boxes[compact, 0].astype(np.int64), x, y, owner)
-
-
-def _not_zero(counts: npt.NDArray[np.uint16]) -> Int64:
-    """Returns numbers of the cells with returns, ascending: most are empty, so four are tested together."""
-    some = counts[: counts.size // 4 * 4].view(np.uint64)
-    cells = (4 * np.flatnonzero(some)[:, None] + np.arange(4)).reshape(-1)
-    cells = np.concatenate([cells, np.arange(4 * some.size, counts.size)])
-    return np.asarray(cells[counts[cells] > 0], np.int64)
+    held = np.flatnonzero(cell >= 0)
+    cells, own = np.unique(cell[held], return_inverse=True)
+    level, rest = np.divmod(cells, rows * columns)
+    row, column = np.divmod(rest, columns)
+    wide = columns + 1  # a free cell beside each row, and a free row beside each slice
+    label = touching((level * (rows + 1) + row) * wide + column, (1, wide - 1, wide, wide + 1))
+    starts, order = in_bins(label, int(label.max(initial=-1)) + 1)
+    first = starts[:-1]
+    span = [np.maximum.reduceat(v[order], first) - np.minimum.reduceat(v[order], first) for v in (row, column)]
+    compact = np.maximum(*span) < round(WIDEST_M / CELL_M)
+    number = np.where(compact, np.cumsum(compact) - 1, -1)
+    owner = np.full(len(returns), -1, np.int32)
+    owner[held] = number[label[own]]
+    held = np.flatnonzero(owner >= 0)
+    count = np.bincount(owner[held], minlength=int(compact.sum()))
+    x, y = (np.bincount(owner[held], v[held], count.size) / count for v in (returns.x_m, returns.y_m))
+    return Slices((window.x_min_m, window.y_min_m), counts, level[order[first]][compact], x, y, owner)
 
 
 def around(slices: Slices, x_m: float, y_m: float, reach_m: float) -> npt.NDArray[Any]:

@@ -13,7 +13,7 @@ import pyarrow as pa
 import shapely
 
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
-from roadscan.assets.memory import once_a_scene
+from roadscan.assets.memory import once_a_tile
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.lines import PIECE_SCHEMA, Chain, chain_of, chains_of, pieces_of_panels
 from roadscan.assets.upright.panels import panels_of
@@ -124,7 +124,7 @@ def probability_of(chain: Chain) -> float:
     )  # fmt: skip
 
 
-@once_a_scene
+@once_a_tile
 def _named_rows(scene: Scene) -> list[tuple[Surface | None, npt.NDArray[np.int64]]]:
     """Returns the likely kind of each part of each panel that comes near the tile, with its returns."""
     return [
@@ -135,7 +135,7 @@ def _named_rows(scene: Scene) -> list[tuple[Surface | None, npt.NDArray[np.int64
     ]
 
 
-@once_a_scene
+@once_a_tile
 def _pieces_of_all(scene: Scene) -> pa.Table:
     """Returns pieces of all panels inside the scene's tile."""
     return pieces_of_panels(scene, panels_of(scene))

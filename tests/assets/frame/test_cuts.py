@@ -27,10 +27,10 @@ POINTS = ("poles", "trees", "signals", "lighting", "delineators", "road_signs", 
 AREAS = ("landscape_areas", "lane_lines", "road_markings")
 
 
-def cut(file: Path, tile_m: float) -> tuple[np.ndarray, dict[str, geopandas.GeoDataFrame]]:
+def cut(file: Path, tile_m: float, together: int = 0) -> tuple[np.ndarray, dict[str, geopandas.GeoDataFrame]]:
     """Place (mm) and class of all returns, and objects by table, as a run with squares of this edge writes them."""
-    survey = changed(Survey.load(file), {"assets__tile_m": tile_m})
-    store = Store(str(file.parent / f"store{tile_m:g}"), survey.config.id)
+    survey = changed(Survey.load(file), {"assets__tile_m": tile_m, "assets__max_scene_returns": together})
+    store = Store(str(file.parent / f"store{tile_m:g}-{together}"), survey.config.id)
     run_stages(Session(survey, store, Inline()), [stage_named(n) for n in ("ingest", "footprints", "assets")])
     read = [laspy.read(store.path(path)) for path in store.files("products/classified_points")]
     rows = [np.column_stack([*(np.rint(1e3 * np.asarray(v)) for v in (r.x, r.y, r.z)), r.classification]) for r in read]
@@ -49,8 +49,8 @@ def twins(one: geopandas.GeoDataFrame, other: geopandas.GeoDataFrame) -> int:
 def test_squares_of_any_edge_find_the_same_on_the_labelled_street(recordings: Path, tmp_path: Path) -> None:
     file = laid_out(recordings / "semantic_kitti_00", tmp_path, range(8))
     whole, objects = cut(file, WHOLE_M)
-    for tile_m in (40.0, 60.0, 80.0, 120.0):
-        classes, found = cut(file, tile_m)
+    for tile_m, together in ((40.0, 0), (60.0, 0), (80.0, 0), (120.0, 0), (80.0, 10**7)):
+        classes, found = cut(file, tile_m, together)
         np.testing.assert_array_equal(classes[:, :3], whole[:, :3])
         assert np.mean(classes[:, 3] != whole[:, 3]) <= CLASSES_DIFFER, tile_m
         for table in AREAS:

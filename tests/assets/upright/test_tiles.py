@@ -35,10 +35,10 @@ def tiles() -> list[Scene]:
     return out
 
 
-def joined(kind: str) -> list[AssetObject]:
+def joined(kind: str, scenes: list[Scene] | None = None) -> list[AssetObject]:
     """Objects of a kind from the pieces of all tiles."""
     one = asset_kinds()[kind]
-    pieces = pa.concat_tables([one.evidence(scene, one.options()).pieces for scene in tiles()])
+    pieces = pa.concat_tables([one.evidence(scene, one.options()).pieces for scene in scenes or tiles()])
     return list(one.objects(pieces, one.options(), {}))
 
 
@@ -49,6 +49,14 @@ def test_points_are_found_once_at_the_same_place(kind: str) -> None:
     assert len(parts) == len(whole) > 0
     for one in whole:
         assert min(one.geometry.distance(other.geometry) for other in parts) < 0.02
+
+
+@pytest.mark.parametrize("kind", ["pole", "lighting", "tree", "delineator", "sign", "clearance"])
+def test_tiles_of_one_scene_hold_what_it_holds(kind: str) -> None:
+    scene, _ = simulated()
+    parts, whole = joined(kind, [scene.of_tile(one.tile) for one in tiles()]), objects_of(scene, kind)
+    assert len(whole) > 0
+    assert [(one.geometry.wkb, one.attributes) for one in parts] == [(o.geometry.wkb, o.attributes) for o in whole]
 
 
 @pytest.mark.parametrize("kind", ["guardrail", "fence", "wall", "facade"])

@@ -40,7 +40,7 @@ class AssetsConfig(SurveySection):
     result but where lines are cut. A search looks beyond its square as far as the ground filter and the kinds need."""
     max_block_returns: int = Field(default=6_000_000, ge=1)
     """Squares that are expected to hold more returns together are not searched by one task; a worker needs about
-    400 MB and 120 bytes a return. Changes no result."""
+    400 MB, and 400 bytes a return of its largest scene. Changes no result."""
     max_scene_returns: int = Field(default=6_000_000, ge=0)
     """Up to four by four squares that are expected to hold no more returns together are searched in one scene, which
     takes less time than one a square; 0: each in its own. Changes no result but what lies where scenes end."""

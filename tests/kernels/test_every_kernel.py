@@ -18,6 +18,8 @@ THROUGH_ITS_CALLER = {
     "tiles.kernels.bucket_statistics.bucket_mirror": "tests/tiles/test_cell_path.py",
     "tiles.kernels.bucket_statistics.bucket_returns": "tests/tiles/test_cell_path.py",
     "tiles.kernels.profile_counting.accumulate_profiles": "tests/tiles/test_cell_path.py",
+    "condition.kernels.sampling.median": "tests/condition/test_lane_texture.py",
+    "condition.kernels.sampling.smallest": "tests/condition/test_lane_texture.py",
     "surface.kernels.faint_cracks.confirm_strips": "tests/surface/test_faint_cracks.py",
     "georeference.kernels.flat_profiles.georeference_flat_profiles": "tests/georeference/test_place.py",
     "poses.kernels.poses.interpolate": "tests/poses/test_trajectory.py",

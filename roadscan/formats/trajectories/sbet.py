@@ -460,9 +460,9 @@ def _check_accuracy(source: LogSource) -> None:
         return
     file, change = beside(source.path, named), "check options.accuracy of the SBET log"
     if Sbet().sniff(file) and not Smrmsg().sniff(file):
-        expected = f"the SMRMSG file of the same mission, with records of {SBET_RECORD_BYTES} bytes"
+        expected = f"the SMRMSG file of the same mission, with records of {RECORD_BYTES} bytes"
         raise FormatError("the accuracy file is an SBET trajectory itself", expected=expected, change=change, file=file)
-    poses, accuracy = _ends(source.path, SBET_RECORD_BYTES), _ends(file, SBET_RECORD_BYTES)
+    poses, accuracy = _ends(source.path, SBET_RECORD_BYTES), _ends(file, RECORD_BYTES)
     weeks = (-WEEK_S, 0, WEEK_S)  # either may count on past the week's end
     if poses and accuracy and not any(poses[0] <= accuracy[1] + w and accuracy[0] + w <= poses[1] for w in weeks):
         count = source.path.stat().st_size // SBET_RECORD_BYTES

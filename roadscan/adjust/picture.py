@@ -87,7 +87,7 @@ def _histogram(axes: Axes, one: Residuals) -> None:
 
 _FIRST: Final = "#d1495b"
 _SECOND: Final = "#1f5fa8"
-_SEAMS_PICTURE_LEAST_MM: Final = 1.0  # Least half range of the colours (mm).
+_LEAST_COLOURS_MM: Final = 1.0  # Least half range of the colours (mm).
 _WORDS: Final = ("before", "after")
 
 
@@ -117,7 +117,7 @@ def draw_seams(shown: Sequence[ShownSeam], path: Path) -> None:
     for part, one in zip(parts.ravel(), shown, strict=True):
         part.suptitle(one.title, fontsize="medium")
         axes = part.subplots(1, 4)
-        limit = max(1e3 * float(np.nanpercentile(np.abs(one.difference_m[0]), 90)), _SEAMS_PICTURE_LEAST_MM)
+        limit = max(1e3 * float(np.nanpercentile(np.abs(one.difference_m[0]), 90)), _LEAST_COLOURS_MM)
         for number, word in enumerate(_WORDS):
             _difference(axes[number], one, number, limit)
             axes[number].set_title(f"difference {word}", fontsize="small")

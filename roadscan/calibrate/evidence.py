@@ -16,7 +16,10 @@ World frame: any right-handed Cartesian frame in metres (ECEF or the local frame
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from roadscan.compute.array_types import Float64, Int64
 
@@ -34,6 +37,17 @@ class Seen:
     """(n, 3, 3)."""
     traverse: Int64
     """(n,) number of the traverse; readings of one traverse share the error of its poses."""
+
+    @classmethod
+    def joined(cls, parts: Sequence[Seen]) -> Seen:
+        """Return the places of several parts of one sensor, one part after another."""
+        return cls(
+            parts[0].sensor,
+            np.concatenate([p.point_sensor_m for p in parts]),
+            np.concatenate([p.position_world_m for p in parts]),
+            np.concatenate([p.world_from_body for p in parts]),
+            np.concatenate([p.traverse for p in parts]),
+        )
 
 
 @dataclass(frozen=True)

@@ -229,6 +229,12 @@ def _is_of_networks(error: BaseException) -> bool:
     )
 
 
+def brief(error: BaseException) -> str:
+    """Return the first line of an error's text."""
+    text = str(error).strip().splitlines()
+    return text[0][:200] if text else type(error).__name__
+
+
 def in_words(error: OSError) -> RoadscanError:
     """Return a file error as one that a user can act on: which file, what is wrong with it, and what to change."""
     if error.filename is None:  # libraries name the file in their own words

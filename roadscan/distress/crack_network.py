@@ -28,7 +28,7 @@ _ASIDE: Final = math.tan(math.radians(30.0))  # Tangent of the most that an end 
 _ASIDE_CELLS: Final = 1.5  # Distance (cells) that is allowed aside on top of that angle.
 _OPPOSITE: Final = -0.5
 """Greatest cosine of the angle between the directions out of two ends."""
-_CHORD_M: Final = 0.1  # The direction of an end is that of a chord about this long (m).
+_CHORD_M: Final = 0.1  # Directions, and those of ends, are those of chords about this long (m).
 
 
 def outwards(line_m: Float64) -> Float64:
@@ -77,8 +77,6 @@ CrackType = Literal["longitudinal", "transverse", "diagonal", "alligator", "unkn
 
 _KINDS: Final[tuple[CrackType, ...]] = ("longitudinal", "transverse", "diagonal", "alligator", "unknown")
 """Names of the types, by the numbers of ``crack_parts``."""
-_CRACK_NETWORK_CHORD_M = 0.1
-"""Directions are those of chords about this long (m)."""
 _BESIDE_NET_M = 0.25
 """A branch that meets a net and has its middle within this distance (m) of the net's hull belongs to the net."""
 _LEAST_SHARE = 0.6
@@ -310,7 +308,7 @@ def depth_sigma_m(depth_m: float, width_cells: float, seen_share: float, reading
 
 def _directions(one: CrackPiece, lane: float, config: CrackJoining) -> tuple[complex, complex, list[float]]:
     """Returns the sums over the chords of a piece that :class:`_Turned` describes."""
-    count = max(1, round(one.length_m / _CRACK_NETWORK_CHORD_M))
+    count = max(1, round(one.length_m / _CHORD_M))
     picked = one.line_m[np.unique(np.linspace(0, len(one.line_m) - 1, count + 1).round().astype(np.int64))]
     chord = np.diff(picked, axis=0)
     size = np.hypot(*chord.T)

@@ -412,14 +412,14 @@ def look_at(run: str, sensor: str, log_format: LogFormat, source: LogSource, hea
     try:
         whole = sum(file.stat().st_size for file in log_format.files(source.path)) <= _WHOLE_BYTES
         table, rows, first, last = "", 0, 0, 0
-        for one in _first_look_timed(log_format.read(source, header), whole):
+        for one in _rows_with_epochs(log_format.read(source, header), whole):
             low, high = _span(one)
             first, last = (min(first, low), max(last, high)) if rows else (low, high)
             table, rows = one.table, rows + one.batch.num_rows
         if not rows:
             return None
         ends = whole
-        for one in () if whole else _first_look_timed(log_format.ending(source, header), whole=True):
+        for one in () if whole else _rows_with_epochs(log_format.ending(source, header), whole=True):
             last, ends = max(last, _span(one)[1]), True
     except (RoadscanError, OSError):  # other checks or the full read report it
         return None
@@ -457,7 +457,7 @@ def never_meeting(survey: Survey, logs: Sequence[LookedAt]) -> list[Fault]:
 
 def _never_meeting(survey: Survey, logs: Sequence[LookedAt]) -> list[Fault]:
     driven = next((own for table in DRIVEN if (own := [one for one in logs if table in one.record.tables])), [])
-    apart = [one.record for one in logs if not any(_first_look_meet(one.longest, other.longest) for other in driven)]
+    apart = [one.record for one in logs if not any(_meet(one.longest, other.longest) for other in driven)]
     return apart_logs(survey, [*(one.record for one in driven), *apart], {}, estimated=False) if apart else []
 
 
@@ -466,11 +466,7 @@ def named(log: LookedAt, path: str) -> LookedAt:
     return replace(log, record=replace(log.record, path=path))
 
 
-def _first_look_meet(a: tuple[int, int], b: tuple[int, int]) -> bool:
-    return a[0] <= b[1] and b[0] <= a[1]
-
-
-def _first_look_timed(items: Iterator[Item], whole: bool) -> Iterator[Rows]:
+def _rows_with_epochs(items: Iterator[Item], whole: bool) -> Iterator[Rows]:
     """Yield rows with epochs: all of them, or only the first."""
     try:
         for item in items:

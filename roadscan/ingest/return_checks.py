@@ -216,7 +216,7 @@ _BITS: Final = 21  # bits of a cell's index along each axis: three fit into 64
 _HALF: Final = 1 << (_BITS - 1)  # added to indices to make them positive
 STRAY: Final = "the point lies alone, over 50 m or over 100 m of height from all others of the cloud"
 TWICE: Final = "the point stands twice in the cloud"
-_STRAY_POINTS_TABLE: Final = "cloud"
+_POINTS: Final = "cloud"
 _PLACE: Final = ("x_m", "y_m", "z_m")
 _SAME: Final = ("epoch_gps_ns", *_PLACE, "return_number", "intensity")
 """Columns in which two equal points agree."""
@@ -237,7 +237,7 @@ class CloudPoints(LogCheck):
 
     def take(self, rows: Rows, refused: Sequence[Int64]) -> None:
         """Count the points of a chunk except those `refused` (by index)."""
-        if rows.table != _STRAY_POINTS_TABLE:
+        if rows.table != _POINTS:
             return
         kept = np.ones(rows.batch.num_rows, dtype=bool)
         for bad in refused:
@@ -263,15 +263,15 @@ class CloudPoints(LogCheck):
 
     def finish(self, writer: LogWriter, header: LogHeader) -> None:
         """Leave strays and duplicate points out of the finished table; record the cloud's mean."""
-        if not writer.rows[_STRAY_POINTS_TABLE]:
+        if not writer.rows[_POINTS]:
             return
         strays = self._strays()
         if strays.size:
             for key in strays.tolist():
                 for file, record, offset in self._first[key]:
                     writer.reject(file, record, offset, 1, STRAY)
-            writer.leave_out(_STRAY_POINTS_TABLE, lambda rows: np.isin(_cells(_places(rows)), strays))
-        twice = writer.leave_out(_STRAY_POINTS_TABLE, _again, _has_ties)
+            writer.leave_out(_POINTS, lambda rows: np.isin(_cells(_places(rows)), strays))
+        twice = writer.leave_out(_POINTS, _again, _has_ties)
         if twice:
             writer.reject("", -1, -1, twice, TWICE)
         if self._points:

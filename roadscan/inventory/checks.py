@@ -66,7 +66,7 @@ _MOVED_M: Final = 100.0
 """Moves farther than this (m) are questioned: no sensor of a survey sees as far."""
 _DRAWN_M: Final = 1000.0
 """A place farther than this (m) from all known assets is questioned: roads of a survey are connected."""
-_AROUND_M: Final = 100.0  # Radius (m) within which known assets show the usual height.
+_AROUND_M: Final = 100.0  # Radius (m) within which other assets show the usual height.
 _RISE_M: Final = 10.0
 """Allowed rise (m): from the foot of a mast to the sign on its gantry, or from a road to one on the bridge over it."""
 _SLOPE: Final = 0.15
@@ -245,7 +245,6 @@ _FORMULA: Final = re.compile(r"^[=@\t\r\n＝＋－＠]|^[+-](?![\s\d.,])|^[+-].*
 _CONTROL: Final = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f]")
 """Control characters, which no text contains and at which some homes truncate a text."""
 _SAME_PLACE_M: Final = 0.05  # New points nearer than this (m) to an asset of their kind are duplicates.
-_CHECKS_AROUND_M: Final = 100.0  # Radius (m) within which other assets show the usual height.
 _LEAST_HEIGHT_M: Final = 2.0  # Height 0 is a fault where assets around stand higher or lower than this (m).
 
 
@@ -381,7 +380,7 @@ def _heights_around(state: State, place_m: npt.NDArray[np.float64]) -> npt.NDArr
             np.asarray(assets.rows[name].to_numpy(zero_copy_only=False), dtype=float)
             for name in ("easting_m", "northing_m", "height_m")
         )
-        found.append(z[(np.hypot(x - place_m[0], y - place_m[1]) <= _CHECKS_AROUND_M) & np.isfinite(z)])
+        found.append(z[(np.hypot(x - place_m[0], y - place_m[1]) <= _AROUND_M) & np.isfinite(z)])
     return np.concatenate(found)
 
 

@@ -195,12 +195,12 @@ _LEAST_PICTURES: Final = 4
 """Pictures, at least: fewer have no scatter to measure."""
 _LEAST_EDGES: Final = 1_000
 """Edges of all pictures, at least."""
-_EDGE_BORESIGHT_APART_DEG: Final = 0.5
+_OTHER_TURN_DEG: Final = 0.5
 """A turn this far from the best one, about an axis across the optical one (degrees), is another one."""
 _BETTER: Final = 3.0
 """The best turn has to be better than each other one by so many σ of the mean of the pictures."""
 _LAGS: Final = 2  # Pictures up to so many apart count as dependent.
-_EDGE_BORESIGHT_STEP: Final = 0.5  # Step of the derivatives of scores, in steps of the turns.
+_DERIVATIVE_STEP: Final = 0.5  # Step of the derivatives of scores, in steps of the turns.
 _FLAT_DEG: Final = 1.0
 """σ about an axis across the optical one beyond which edges do not tell it (degrees)."""
 _FIRST_PLACE: Final = 3_000_000_000
@@ -295,7 +295,7 @@ def boresight_of(of: Sighted, scores: Sequence[EdgeScores], shared_rad: float) -
 def _rival(each: Float64, total: Float64, at: npt.NDArray[np.int64]) -> str:
     """Returns why the best turn is none, where another one is as good."""
     step = float(TURNS_DEG[0][1] - TURNS_DEG[0][0])
-    rows, columns = (np.abs(np.arange(total.shape[k]) - at[k]) * step > _EDGE_BORESIGHT_APART_DEG for k in (0, 1))
+    rows, columns = (np.abs(np.arange(total.shape[k]) - at[k]) * step > _OTHER_TURN_DEG for k in (0, 1))
     other = np.where((rows[:, None] | columns)[:, :, None], total, -np.inf)
     second = np.unravel_index(int(np.argmax(other)), total.shape)
     better = each[:, at[0], at[1], at[2]] - each[:, second[0], second[1], second[2]]
@@ -327,16 +327,16 @@ def _value(spline: Float64, places: Float64) -> Float64:
 
 def _slope(spline: Float64, place: Float64) -> Float64:
     """Returns derivatives (3,) a step."""
-    ends = np.concatenate([place + _EDGE_BORESIGHT_STEP * np.eye(3), place - _EDGE_BORESIGHT_STEP * np.eye(3)])
+    ends = np.concatenate([place + _DERIVATIVE_STEP * np.eye(3), place - _DERIVATIVE_STEP * np.eye(3)])
     value = _value(spline, ends)
-    return np.asarray((value[:3] - value[3:]) / (2.0 * _EDGE_BORESIGHT_STEP))
+    return np.asarray((value[:3] - value[3:]) / (2.0 * _DERIVATIVE_STEP))
 
 
 def _curvature(spline: Float64, place: Float64) -> Float64:
     """Returns second derivatives (3, 3)."""
     rows = [
-        (_slope(spline, place + _EDGE_BORESIGHT_STEP * e) - _slope(spline, place - _EDGE_BORESIGHT_STEP * e))
-        / (2.0 * _EDGE_BORESIGHT_STEP)
+        (_slope(spline, place + _DERIVATIVE_STEP * e) - _slope(spline, place - _DERIVATIVE_STEP * e))
+        / (2.0 * _DERIVATIVE_STEP)
         for e in np.eye(3)
     ]
     whole = np.array(rows)

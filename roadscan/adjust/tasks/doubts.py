@@ -355,7 +355,7 @@ FIXED_RUN: Final = Witness(
     does="it is held all the same, other runs are adjusted to it, and their σ hold what contradicts it",
     told=("findings",),
 )
-_FIXED_WORDS: Final = {
+_AXIS_WORDS: Final = {
     "north_m": "to the north", "east_m": "to the east", "down_m": "down", "roll_rad": "of roll",
     "pitch_rad": "of pitch", "heading_rad": "of heading",
 }  # fmt: skip
@@ -368,7 +368,7 @@ def fixed_findings(fixed: Sequence[FixedRun], false_alarm: float) -> list[Findin
         off = one.contradicted(false_alarm)
         if off:
             told = ", ".join(
-                f"{_size(name, error)} {_FIXED_WORDS[name]} ({sigmas:.1f} σ)" for name, error, sigmas in off
+                f"{_size(name, error)} {_AXIS_WORDS[name]} ({sigmas:.1f} σ)" for name, error, sigmas in off
             )
             text = (
                 f"it is held fixed, and other evidence puts its poses up to {told} from where they were recorded; "

@@ -225,9 +225,9 @@ def _loaded(manifest: Manifest, task: DepthTask, mounted: Mounted, plan: SurveyP
 SCORES: Final = "edge_scores"
 """Table, and product of its files in the manifest."""
 BORESIGHTS: Final = "edge_boresights"
-_EDGE_SCORES_MOMENT_NS: Final = 50_000_000
+_COMPARED_MOMENT_NS: Final = 50_000_000
 """Returns so long before and after a picture (ns) are of its moment: one turn of a lidar at 10 Hz."""
-_EDGE_SCORES_MOST_PICTURES: Final = 60
+_MOST_COMPARED: Final = 60
 """Pictures that are compared, at most, spread over the survey: some dozen tell the boresight to what all edges have in
 common."""
 _EVERY_M: Final = 0.25
@@ -268,10 +268,10 @@ def edge_tasks(plan: SurveyPlan, exposures: Exposures, priors: CameraPriors) -> 
     around = np.array([camera.lens.is_around for camera in exposures.cameras], bool)
     usable = ~around[exposures.camera] if around.size else np.zeros(0, bool)
     lidars, code, tasks = lidars_of(plan), code_digest(f"{__name__}:write_scores"), []
-    for number in chosen_pictures(exposures, usable, _EVERY_M, _EDGE_SCORES_MOST_PICTURES).tolist():
+    for number in chosen_pictures(exposures, usable, _EVERY_M, _MOST_COMPARED).tolist():
         own = exposures.at(np.array([number]))
         camera, epoch = own.cameras[int(own.camera[0])], int(own.epoch_gps_ns[0])
-        span = [(epoch - _EDGE_SCORES_MOMENT_NS, epoch + _EDGE_SCORES_MOMENT_NS)]
+        span = [(epoch - _COMPARED_MOMENT_NS, epoch + _COMPARED_MOMENT_NS)]
         for (run, lidar), files in lidars.items():
             near = [NearFile.of(source, file, span) for source, file in files] if run == camera.run else []
             there = tuple(one for one in near if one is not None)
@@ -298,7 +298,7 @@ def write_scores(task: EdgeTask) -> OutputRecord:
     camera = own.cameras[int(own.camera[0])]
     parts = [np.zeros((0, 3))]
     for points_m, epochs_gps_ns in readings_about(task.store, task.ground, task.files):
-        now = np.abs(epochs_gps_ns - own.epoch_gps_ns[0]) <= _EDGE_SCORES_MOMENT_NS
+        now = np.abs(epochs_gps_ns - own.epoch_gps_ns[0]) <= _COMPARED_MOMENT_NS
         world = task.ground.map.world_from_map(camera.world, points_m[now])
         body = (world - own.body_world_m[0]) @ own.world_from_body[0]
         seen = (body - own.lever_body_m[0]) @ own.body_from_opencv[0]
@@ -341,12 +341,12 @@ def load_boresights(
             camera_name, lidar, seat, lidar_seat, int(numbers.camera[int(exposure.camera[0])]),
             exposure.body_from_opencv[0], sigma, plan.survey.rig.sensors[camera_name].boresight_sigma_deg is None,
         )  # fmt: skip
-        scores = [one for task in own for one in _edge_scores_loaded(manifest, task, plan.store)]
+        scores = [one for task in own for one in _stored_scores(manifest, task, plan.store)]
         found.append(boresight_of(sighted, scores, float(np.radians(priors.sigma_shared_edge_deg))))
     return tuple(found)
 
 
-def _edge_scores_loaded(manifest: Manifest, task: EdgeTask, store: Store) -> list[EdgeScores]:
+def _stored_scores(manifest: Manifest, task: EdgeTask, store: Store) -> list[EdgeScores]:
     record = manifest.get(SCORES, task.unit)
     if record is None or not record.path:
         return []

@@ -83,11 +83,7 @@ def _rows(run: str, own: Corrections, writer: str | None) -> list[dict[str, Any]
     columns |= dict(zip(COMPONENTS[3:], own.roll_pitch_heading_rad.T.tolist(), strict=True))
     if own.sigma is not None:
         columns |= dict(zip(CORRECTION_SIGMAS, own.sigma.T.tolist(), strict=True))
-    names = list(columns)
-    return [
-        {"run": run, "written_by": writer, **dict(zip(names, row, strict=True))}
-        for row in zip(*columns.values(), strict=True)
-    ]
+    return [{"run": run, "written_by": writer, **row} for row in _row_dicts(columns)]
 
 
 _SAME_SIGMA: Final = 0.05
@@ -167,7 +163,7 @@ def tie_rows(evidence: Evidence, solution: Solution, held: Held, mounted: Float6
     columns = {name: np.asarray(ties.columns[name]).tolist() for name in names}
     columns |= {"before_m": ties.observations.observed_m.tolist(), "after_m": after.tolist()}
     columns["weight"] = solution.tie_weight.tolist()
-    return _figures_rows(columns)
+    return _row_dicts(columns)
 
 
 def relative_rows(evidence: Evidence, tracks: Sequence[Track], held: Held, mounted: Float64) -> Rows:
@@ -195,7 +191,7 @@ def relative_rows(evidence: Evidence, tracks: Sequence[Track], held: Held, mount
                 "rms_before_m": sections.rms_before_m.tolist(),
                 "rms_after_m": sections.rms_after_m.tolist(),
             }
-            rows += [{"run": evidence.runs[number], "kind": kind, **row} for row in _figures_rows(columns)]
+            rows += [{"run": evidence.runs[number], "kind": kind, **row} for row in _row_dicts(columns)]
     return rows
 
 
@@ -354,6 +350,6 @@ def _accuracy(
     }  # fmt: skip
 
 
-def _figures_rows(columns: Mapping[str, list[Any]]) -> Rows:
+def _row_dicts(columns: Mapping[str, list[Any]]) -> Rows:
     names = list(columns)
     return [dict(zip(names, row, strict=True)) for row in zip(*columns.values(), strict=True)]

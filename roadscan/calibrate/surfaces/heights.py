@@ -433,7 +433,7 @@ def _ties(group: Sequence[Matched], level_from_world: Float64) -> list[Ties]:
         row = np.where(knows[:, :1, None], one.level[:, :1], one.level[:, 1:])
         found["shifts one way"].append(_tied(one, one.felt_m, row, knows.any(axis=1) & ~both, level_from_world))
     return [
-        Ties(f"overlap, {kind}", _joined([a for a, _, _ in parts]), _joined([b for _, b, _ in parts]),
+        Ties(f"overlap, {kind}", Seen.joined([a for a, _, _ in parts]), Seen.joined([b for _, b, _ in parts]),
              np.concatenate([w for _, _, w in parts]))
         for kind, parts in found.items()
         if sum(len(w) for _, _, w in parts)
@@ -451,14 +451,4 @@ def _tied(
         one.first.placed.seen(place_m[keep], first[keep]),
         one.second.placed.seen(there[keep], second[keep]),
         rows[keep] @ level_from_world,
-    )
-
-
-def _joined(parts: Sequence[Seen]) -> Seen:
-    return Seen(
-        parts[0].sensor,
-        np.concatenate([p.point_sensor_m for p in parts]),
-        np.concatenate([p.position_world_m for p in parts]),
-        np.concatenate([p.world_from_body for p in parts]),
-        np.concatenate([p.traverse for p in parts]),
     )

@@ -35,7 +35,7 @@ EDGE_MARGINS_M: Final = (0.08, 0.05, 0.03)
 """Readings nearer to an edge are not used: the first limit at first, the later ones as the mountings improve."""
 
 _CELL_M: Final = 0.02  # Edge of a cell whose readings are averaged.
-_LEAST: Final = 4  # Least number of readings of a cell.
+_LEAST: Final = 4  # Least number of readings of a cell, and of cells that two heads have in common.
 _NOISE_M: Final = 2e-5  # Least σ of a reading's height that is assumed.
 _SEARCH_M: Final = 0.3  # The object is searched for within this distance of its stated place.
 _TRUNCATED_M: Final = 0.008  # Height residuals count up to this in the search.
@@ -218,8 +218,7 @@ def _joined(parts: Sequence[tuple[Seen, Float64, Float64]], name: str) -> Ties:
     )
 
 
-_HEADS_CELL_M: Final = 0.01  # Edge of a cell in which heights are compared.
-_HEADS_LEAST: Final = 4  # Least number of readings of a cell, and least number of common cells.
+_COMPARED_CELL_M: Final = 0.01  # Edge of a cell in which heights are compared.
 _EVEN: Final = 4.0
 """Cells with a variance above this multiple of the usual one lie on an edge."""
 _FLOOR_M: Final = 2e-5  # Added to the limit for outlying differences: rounding.
@@ -326,15 +325,15 @@ def _strip(first: Placed, second: Placed, level_from_world: Float64) -> Ties | N
     """Return the ties of two heads in one drive."""
     if first.readings.sensor == second.readings.sensor:
         return None
-    own, other = (_cells(one.place_m, _HEADS_CELL_M, _HEADS_LEAST) for one in (first, second))
+    own, other = (_cells(one.place_m, _COMPARED_CELL_M, _LEAST) for one in (first, second))
     _, a, b = np.intersect1d(own.key, other.key, assume_unique=True, return_indices=True)
-    if a.size < _HEADS_LEAST:
+    if a.size < _LEAST:
         return None
     variance = own.variance_m2[a] + other.variance_m2[b]
     away = own.height_m[a] - other.height_m[b]
     spread = scatter_about(away, float(np.median(away)))
     kept = (variance <= _EVEN * np.median(variance)) & (np.abs(away - np.median(away)) <= _OUTLYING * spread + _FLOOR_M)
-    if kept.sum() < _HEADS_LEAST:
+    if kept.sum() < _LEAST:
         return None
     a, b, variance = a[kept], b[kept], variance[kept]
     # An error that all cells share does not average out.

@@ -445,7 +445,7 @@ def _ties(
         ends = (_seen(found, first[inside], all_placed[a]), _seen(found, second[inside], all_placed[b]))
         parts.setdefault((sensors[a], sensors[b]), []).append((*ends, rows[inside]))
     return [
-        Ties("overlap, planes", _all([p[0] for p in some]), _all([p[1] for p in some]),
+        Ties("overlap, planes", Seen.joined([p[0] for p in some]), Seen.joined([p[1] for p in some]),
              np.concatenate([p[2] for p in some]))
         for some in parts.values()
     ]  # fmt: skip
@@ -453,13 +453,3 @@ def _ties(
 
 def _seen(found: _Patches, which: Int64, one: Placed) -> Seen:
     return one.seen(found.centre_m[which], found.pose[which], found.position_m[which])
-
-
-def _all(parts: Sequence[Seen]) -> Seen:
-    return Seen(
-        parts[0].sensor,
-        np.concatenate([p.point_sensor_m for p in parts]),
-        np.concatenate([p.position_world_m for p in parts]),
-        np.concatenate([p.world_from_body for p in parts]),
-        np.concatenate([p.traverse for p in parts]),
-    )

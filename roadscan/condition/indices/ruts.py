@@ -69,7 +69,6 @@ class RutStraightedge(ConditionIndex):
                 yield from by_section(depth, lane, ((_name(side, length, "_mean"), "mean"),))
 
 
-_RUT_WIRE_MM: Final = 1e3  # Millimetres in a metre.
 _WATER: Final = (
     Quantity("water_depth_mm", "mm", "Greatest depth of water that stands in a cross-section"),
     Quantity("water_depth_max_mm", "mm", "The same, greatest of the section"),
@@ -108,8 +107,8 @@ class RutWire(ConditionIndex):
             return PerCrossSection(name, c.station_m, whole.spread(values, n), sigma, c.share, whole.noisy)
 
         for half, side in enumerate(("left", "right")):
-            sigma = whole.spread(_RUT_WIRE_MM * whole.sigma_m * np.sqrt(found[:, half, 4]), n)
-            depth = held(f"rut_depth_{side}_mm", _RUT_WIRE_MM * found[:, half, 0], sigma)
+            sigma = whole.spread(_MM * whole.sigma_m * np.sqrt(found[:, half, 4]), n)
+            depth = held(f"rut_depth_{side}_mm", _MM * found[:, half, 0], sigma)
             yield from depth.values()
             wanted: tuple[tuple[str, How], ...] = (
                 (f"rut_depth_mean_{side}_mm", "mean"),
@@ -123,7 +122,7 @@ class RutWire(ConditionIndex):
             yield from held(f"rut_area_{side}_m2", found[:, half, 2], whole.spread(sigma_area, n)).values()
         standing = np.zeros_like(whole.height_m)
         water(whole.height_m, standing)
-        sigma = whole.spread(_RUT_WIRE_MM * whole.sigma_m * np.sqrt(2.0), n)
-        deepest = held("water_depth_mm", _RUT_WIRE_MM * standing.max(axis=1, initial=0.0), sigma)
+        sigma = whole.spread(_MM * whole.sigma_m * np.sqrt(2.0), n)
+        deepest = held("water_depth_mm", _MM * standing.max(axis=1, initial=0.0), sigma)
         yield from deepest.values()
         yield from by_section(deepest, lane, (("water_depth_max_mm", "max"),))

@@ -12,8 +12,8 @@ import pyproj
 from pyproj.exceptions import CRSError as ProjCrsError
 
 from roadscan.core.crs import NO_HEIGHTS, HeightKind, StatedHeights, crs_from_text, heights_of, vertical_of
-from roadscan.core.errors import ConfigError, CrsError, Missing
-from roadscan.formats.clouds.las_file import Cloud, brief, unreadable
+from roadscan.core.errors import ConfigError, CrsError, Missing, brief
+from roadscan.formats.clouds.las_file import Cloud, unreadable
 from roadscan.ingest.reading.format import LogSource
 from roadscan.store.codecs.geo_keys import DIRECTORY, DOUBLES, TEXTS, crs_of_keys, short_keys
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, BinaryIO, Final, Self, TypeAlias
 import numpy as np
 
 from roadscan.compute.array_types import Int64
-from roadscan.core.errors import FormatError
+from roadscan.core.errors import FormatError, brief
 from roadscan.ingest.reading.format import Reject
 from roadscan.store.codecs.laz import Laz, LazChunks, LazError
 
@@ -296,9 +296,3 @@ def _chunks(laz: Laz, stream: BinaryIO, head: Head, path: Path) -> LazChunks:
             change="fetch the file again, or recover it with the program that wrote it",
             file=path,
         ) from error
-
-
-def brief(error: BaseException) -> str:
-    """Return the first line of an error's text."""
-    text = str(error).strip().splitlines()
-    return text[0][:200] if text else type(error).__name__

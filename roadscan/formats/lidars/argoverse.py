@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from roadscan.core.errors import FormatError, Missing, TimeSystemError
+from roadscan.core.errors import FormatError, Missing, TimeSystemError, brief
 from roadscan.core.toml_text import toml
 from roadscan.formats.lidars.packet_returns import returns_batch
 from roadscan.ingest.reading.column_table import unlisted_batches, unlisted_reason
@@ -91,7 +91,7 @@ class Argoverse(LogFormat):
                 if not _has_columns(sweep.schema):
                     raise ValueError(f"its columns are {', '.join(sweep.schema.names)}")
             except (*UNREADABLE, TimeSystemError) as error:
-                yield Reject(f"the sweep cannot be read: {_brief(error)}", 0, -1, 1, name)
+                yield Reject(f"the sweep cannot be read: {brief(error)}", 0, -1, 1, name)
                 continue
             yield from _items(sweep, name, stamp, number)
             unlisted = unlisted_batches(file, sweep.num_record_batches)
@@ -157,7 +157,7 @@ def _items(sweep: Any, name: str, stamp_gps_ns: int, number: int) -> Iterator[It
             batch = sweep.get_batch(index).select(list(_COLUMNS))
             batch.validate(full=True)
         except UNREADABLE as error:
-            yield Reject(f"the sweep's record batch is damaged: {_brief(error)}", first, -1, 1, name)
+            yield Reject(f"the sweep's record batch is damaged: {brief(error)}", first, -1, 1, name)
             continue
         for start in range(0, batch.num_rows, _CHUNK_RETURNS):
             chunk = batch.slice(start, _CHUNK_RETURNS)
@@ -201,8 +201,3 @@ def _numpy(batch: pa.RecordBatch, name: str) -> npt.NDArray[Any]:
         column.fill_null(0) if column.null_count and not pa.types.is_float16(column.type) else column
     ).to_numpy(zero_copy_only=False)
     return values
-
-
-def _brief(error: BaseException) -> str:
-    text = str(error).strip().splitlines()
-    return text[0][:200] if text else type(error).__name__

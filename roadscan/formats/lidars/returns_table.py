@@ -30,9 +30,9 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from roadscan.core.errors import ConfigError, FormatError
+from roadscan.core.errors import ConfigError, FormatError, brief
 from roadscan.ingest.array_files import ClockLike, WrittenLog, epochs_gps_ns, float_array, parquet_file, whole_array
-from roadscan.ingest.reading.column_table import Lost, brief, is_number, open_table
+from roadscan.ingest.reading.column_table import Lost, is_number, open_table, schema_or_none, table_files
 from roadscan.ingest.reading.columns import Found
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import EpochReader, Sieve
@@ -48,7 +48,6 @@ _WHOLE: Final = {"intensity": np.uint16, "laser": np.uint8, "sweep": np.int32}
 _COLUMNS: Final = (EPOCH, _STAMP, _POSE_EPOCH, *AXES, *_WHOLE)
 _FARTHEST_M: Final = 10_000.0  # farther positions count as damage
 _CHUNK_ROWS: Final = 1 << 17  # rows of a chunk
-_SUFFIXES: Final = (".parquet", ".arrow", ".feather", ".ipc")
 
 
 class ReturnsTable(LogFormat):
@@ -71,14 +70,12 @@ class ReturnsTable(LogFormat):
 
     def files(self, path: Path) -> list[Path]:
         """Return the file, or all Parquet and Arrow files of the folder by name."""
-        if not path.is_dir():
-            return [path]
-        return sorted(p for p in path.rglob("*") if p.suffix.lower() in _SUFFIXES and p.is_file())
+        return table_files(path)
 
     def header(self, source: LogSource) -> LogHeader:
         """Check the columns; all files of a folder must have the same column of time."""
         files = self.files(source.path)
-        schemas = {file: schema for file in files if (schema := _schema_or_none(file)) is not None}
+        schemas = {file: schema for file in files if (schema := schema_or_none(file)) is not None}
         if not schemas:
             raise FormatError(
                 "no file can be read" if files else "the folder holds no table",
@@ -117,13 +114,6 @@ class ReturnsTable(LogFormat):
                     yield Reject(part.reason, first, -1, max(part.records, 1), name)
                 else:
                     yield from _returns(part, stamps, epochs, name, first)
-
-
-def _schema_or_none(file: Path) -> pa.Schema | None:
-    try:
-        return open_table(file).schema
-    except (*UNREADABLE, FormatError):
-        return None
 
 
 def _is_returns(schema: pa.Schema) -> bool:

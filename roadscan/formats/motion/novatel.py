@@ -174,11 +174,11 @@ class NovatelBestpos(LogFormat):
         gps_clock(source, "NovAtel's messages state")
         if not counted_messages(source.path)["BESTPOSA"]:
             raise FormatError("the beginning holds no sound BESTPOSA message", expected="one", file=source.path)
-        return LogHeader({"world_frame": _placement(source).world, "read": "BESTPOSA"})
+        return LogHeader({"world_frame": _placement(source, _BY_BESTPOS).world, "read": "BESTPOSA"})
 
     def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
         """Stream positions; a damaged message is rejected."""
-        reader = GnssReader(source, _placement(source))
+        reader = GnssReader(source, _placement(source, _BY_BESTPOS))
         epochs = EpochReader(gps_clock(source, "NovAtel's messages state"), source.path)
         for block in message_blocks(source.path, "BESTPOSA"):
             if isinstance(block, Reject):
@@ -189,9 +189,14 @@ class NovatelBestpos(LogFormat):
             yield from reader.items(_solutions(block, stamps, sieve), sieve)
 
 
-def _placement(source: LogSource) -> GeodeticPlacement:
+_BY_BESTPOS: Final = "BESTPOS, whose height and undulation are added"
+_BY_DEFINITION: Final = "the definition of NovAtel's messages"
+
+
+def _placement(source: LogSource, by: str) -> GeodeticPlacement:
+    """Return the placement of ellipsoidal heights, which `by` (what defines them, in words) states."""
     placement = GeodeticPlacement(source.need_crs(), "ellipsoidal", None, source.path)
-    source.need_height("ellipsoidal", "BESTPOS, whose height and undulation are added")
+    source.need_height("ellipsoidal", by)
     return placement
 
 
@@ -258,12 +263,12 @@ class NovatelIns(LogFormat):
         message = _message(source)
         gps_clock(source, "NovAtel's messages state")
         others = ", ".join(name for name in counts if name != message)
-        attributes = {"world_frame": _novatel_ins_placement(source).world, "read": message}
+        attributes = {"world_frame": _placement(source, _BY_DEFINITION).world, "read": message}
         return LogHeader(attributes | ({"not_read": others} if others else {}))
 
     def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
         """Stream poses; a damaged message, and one without a solution, is rejected."""
-        reader = PoseReader(source, gps_clock(source, "NovAtel's messages state"), _novatel_ins_placement(source))
+        reader = PoseReader(source, gps_clock(source, "NovAtel's messages state"), _placement(source, _BY_DEFINITION))
         for block in message_blocks(source.path, _message(source)):
             if isinstance(block, Reject):
                 yield block
@@ -284,12 +289,6 @@ def _message(source: LogSource) -> str:
             file=source.path,
         )
     return stated or max(found, key=lambda name: counts[name])
-
-
-def _novatel_ins_placement(source: LogSource) -> GeodeticPlacement:
-    placement = GeodeticPlacement(source.need_crs(), "ellipsoidal", None, source.path)
-    source.need_height("ellipsoidal", "the definition of NovAtel's messages")
-    return placement
 
 
 def _poses(block: TextBlock, sieve: Sieve) -> RawPoses:

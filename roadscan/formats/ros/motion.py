@@ -208,7 +208,7 @@ def _text(content: Any) -> str:
     return str(content.sentence if hasattr(content, "sentence") else content.data)
 
 
-_IMU_LOOKED_AT: Final = 400  # messages from whose forces the unit is checked
+_FORCES_LOOKED_AT: Final = 400  # messages from whose forces the unit is checked
 _LEAST_FORCE_M_PER_S2: Final = 8.0
 """Least median force of a vehicle, of which gravity is the most: less is another unit, or gravity was taken away."""
 _MOST_FORCE_M_PER_S2: Final = 12.0  # greatest median force of a vehicle
@@ -292,7 +292,7 @@ def _unit(source: LogSource, bag: Bag, topic: Topic) -> str:
         if not isinstance(item, Reject):
             vector = item[1].linear_acceleration
             forces.append(math.hypot(vector.x, vector.y, vector.z))
-        if len(forces) >= _IMU_LOOKED_AT:
+        if len(forces) >= _FORCES_LOOKED_AT:
             break
     middle = float(np.median(forces)) if forces else STANDARD_GRAVITY_M_PER_S2
     if not _LEAST_FORCE_M_PER_S2 < middle < _MOST_FORCE_M_PER_S2:
@@ -345,7 +345,7 @@ class RosPoses(TopicFormat):
     def attributes(self, source: LogSource, bag: Bag, topic: Topic) -> dict[str, Any]:
         """Check CRS, heights and axes; an Odometry names its child frame."""
         options = options_of(source, RosPosesOptions)
-        placement = _poses_placement(source)
+        placement = _odometry_placement(source)
         body_quaternion(options.axes, source.path)
         first = next((one[1] for one in bag.decoded(topic.name) if isinstance(one, tuple)), None)
         child = getattr(first, "child_frame_id", "")
@@ -353,7 +353,7 @@ class RosPoses(TopicFormat):
 
     def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
         """Stream poses; a message that holds none is rejected."""
-        placement = _poses_placement(source)
+        placement = _odometry_placement(source)
         reader = PoseReader(source, message_clock(source), placement)
         body = body_quaternion(options_of(source, RosPosesOptions).axes, source.path)
         with Bag.open(source.path) as bag:
@@ -365,7 +365,7 @@ class RosPoses(TopicFormat):
                     yield block
 
 
-def _poses_placement(source: LogSource) -> Placement:
+def _odometry_placement(source: LogSource) -> Placement:
     crs = source.need_crs(LOCAL_WORLD)
     if crs != LOCAL_WORLD and crs_from_text(crs).is_projected:
         return level_placement(source, options_of(source, RosPosesOptions).heading)

@@ -39,12 +39,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from roadscan.compute.array_types import Float64
-from roadscan.core.errors import ConfigError, FormatError, Missing
+from roadscan.core.errors import ConfigError, FormatError, Missing, brief
 from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.core.scan_geometry import ScanGeometry
 from roadscan.core.strict import Strict
 from roadscan.ingest.array_files import ClockLike, WrittenLog, epochs_gps_ns, float_array, parquet_file, whole_array
-from roadscan.ingest.reading.column_table import Lost, brief, open_table
+from roadscan.ingest.reading.column_table import Lost, open_table, schema_or_none, table_files
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
 from roadscan.ingest.reading.stamps import EPOCH, column_stamps, refuse_clock
@@ -56,7 +56,6 @@ GEOMETRY_KEY: Final = "roadscan.scan_geometry"
 _STAMP: Final = "time"
 _CHUNK_BYTES: Final = 8 << 20  # bytes of a chunk of rows
 _COLUMNS: Final = (EPOCH, _STAMP, "range", "intensity", "encoder_ticks")
-_SUFFIXES: Final = (".parquet", ".arrow", ".feather", ".ipc")
 
 
 class ScansOptions(Strict):
@@ -93,14 +92,12 @@ class Scans(LogFormat):
 
     def files(self, path: Path) -> list[Path]:
         """Return the file, or all Parquet and Arrow files of the folder by name."""
-        if not path.is_dir():
-            return [path]
-        return sorted(p for p in path.rglob("*") if p.suffix.lower() in _SUFFIXES and p.is_file())
+        return table_files(path)
 
     def header(self, source: LogSource) -> LogHeader:
         """Return geometry and time column; all files of a folder must agree."""
         files = self.files(source.path)
-        schemas = [(file, schema) for file in files if (schema := _schema_or_none(file)) is not None]
+        schemas = [(file, schema) for file in files if (schema := schema_or_none(file)) is not None]
         if not schemas:
             raise FormatError(
                 "no file can be read" if files else "the folder holds no table",
@@ -159,13 +156,6 @@ def _parts(file: Path, rows: int) -> Iterator[tuple[int, pa.RecordBatch | Lost]]
     yield from table.parts(rows, _COLUMNS)
 
 
-def _schema_or_none(file: Path) -> pa.Schema | None:
-    try:
-        return open_table(file).schema
-    except (*UNREADABLE, FormatError):
-        return None
-
-
 def _is_list(kind: pa.DataType) -> bool:
     return bool(pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind))
 
@@ -204,7 +194,7 @@ def _check_columns(schema: pa.Schema, file: Path) -> None:
 
 def _clock(source: LogSource, files: list[Path]) -> Clock:
     """Return the clock of the stamps, by the first readable file."""
-    schema = next((schema for file in files if (schema := _schema_or_none(file)) is not None), None)
+    schema = next((schema for file in files if (schema := schema_or_none(file)) is not None), None)
     stamped = schema is not None and EPOCH not in schema.names
     return (source.any_clock if stamped else None) or Clock(TimeSystem.GPS, unit="ns")
 
@@ -349,7 +339,7 @@ def write_profiles(
     across = float_array(across_m, np.shape(across_m), "across_m")
     heights = float_array(heights_m, (epoch_gps_ns.size, across.size), "heights_m")
     light = None if intensity is None else whole_array(intensity, heights.shape, np.uint8, "intensity")
-    geometry = _profiles_writer_geometry(across, _span(heights, sensor_height_m), quantum)
+    geometry = _written_geometry(across, _span(heights, sensor_height_m), quantum)
     metadata = {GEOMETRY_KEY: json.dumps(geometry.model_dump(mode="json"))}
     fields = [("epoch_gps_ns", pa.int64()), ("range", pa.list_(pa.uint16(), across.size))]
     fields += [] if light is None else [("intensity", pa.list_(pa.uint8(), across.size))]
@@ -387,9 +377,7 @@ def _span(heights: Float64, sensor_height_m: float) -> tuple[float, float]:
     return nearest, farthest
 
 
-def _profiles_writer_geometry(
-    across: Float64, span: tuple[float, float], quantum: float | ScanGeometry | None
-) -> ScanGeometry:
+def _written_geometry(across: Float64, span: tuple[float, float], quantum: float | ScanGeometry | None) -> ScanGeometry:
     first, step = _even(across)
     if isinstance(quantum, ScanGeometry):
         _check_same(quantum, first, step, across.size)

@@ -125,7 +125,7 @@ def _cells(line: str, delimiter: str) -> list[str]:
     return [word.strip(' ()[]#"') for word in line.split(delimiter)]
 
 
-_POSPAC_TEXT_NAMES: Final = re.compile(r"\s*TIME\s*,.*\bROLL\s*,\s*PITCH\s*,\s*HEADING\b")
+_POSPAC_HEADER: Final = re.compile(r"\s*TIME\s*,.*\bROLL\s*,\s*PITCH\s*,\s*HEADING\b")
 _UNIT_PROSE: Final = {
     "TIME": r"time in (\S+)",
     "EASTING": r"position in (\S+)",
@@ -141,7 +141,7 @@ _LIKE: Final = {
     "NORTH VELOCITY": "EAST VELOCITY", "UP VELOCITY": "EAST VELOCITY", "NORTH SD": "EAST SD", "HEIGHT SD": "EAST SD",
 }  # fmt: skip
 _DATE: Final = re.compile(r"\s*Date of Mission:\s*(\d{4})-(\d\d)-(\d\d)")
-_POSPAC_TEXT_SAID: Final = re.compile(
+_POSPAC_SAID: Final = re.compile(
     r"\s*(Date of Mission|Mapping frame datum|POSPROC SBET file|Boresight values|Lever arm values):?\s+(.*)"
 )
 
@@ -172,7 +172,7 @@ class PospacText(OfficeTrajectory):
 
     def preamble(self, lines: Sequence[str]) -> Preamble | None:
         """Return the columns, with the units that the prose below their names states."""
-        at = next((k for k, line in enumerate(lines) if _POSPAC_TEXT_NAMES.match(line)), None)
+        at = next((k for k, line in enumerate(lines) if _POSPAC_HEADER.match(line)), None)
         if at is None:
             return None
         below = next((k for k, line in enumerate(lines[at + 1 : at + 4], at + 1) if "time in" in line), at)
@@ -181,7 +181,7 @@ class PospacText(OfficeTrajectory):
         units = {name: one[1].strip(",") for name, one in found.items() if one is not None}
         cells = [Cell(name, units.get(_LIKE.get(name, name), "")) for name in map(str.strip, lines[at].split(","))]
         first = next((line for line in lines[below + 1 :] if line.strip()), "")
-        said = {one[1]: one[2].strip(" ;:") for line in lines[:at] if (one := _POSPAC_TEXT_SAID.match(line))}
+        said = {one[1]: one[2].strip(" ;:") for line in lines[:at] if (one := _POSPAC_SAID.match(line))}
         return Preamble(cells, below + 1, "," if "," in first else " ", said, _date_of(lines[:at]))
 
 

@@ -307,7 +307,7 @@ class TrajectoryCsvOptions(TextOptions):
 
 
 @dataclass(frozen=True)
-class _TrajectoryCsvPlan:
+class _CsvPlan:
     """How a file is read."""
 
     layout: TextLayout
@@ -350,13 +350,13 @@ class TrajectoryCsv(LogFormat):
 
     def header(self, source: LogSource) -> LogHeader:
         """Find the columns and check clock, CRS and heading."""
-        plan = _trajectory_csv_plan(source)
+        plan = _csv_plan(source)
         columns = {quantity: found.column for quantity, found in plan.columns.items()}
         return LogHeader({"world_frame": plan.placement.world, "columns": columns})
 
     def read(self, source: LogSource, header: LogHeader) -> Iterator[Item]:
         """Stream poses; a line that cannot be read is rejected."""
-        plan = _trajectory_csv_plan(source)
+        plan = _csv_plan(source)
         reader = PoseReader(source, plan.stamps.clock, plan.placement)
         for block in text_blocks(source.path, plan.layout, plan.kinds):
             if isinstance(block, Reject):
@@ -367,7 +367,7 @@ class TrajectoryCsv(LogFormat):
             yield from reader.items(level_poses(records, plan.crs, plan.columns, block.number, sieve), sieve)
 
 
-def _trajectory_csv_plan(source: LogSource) -> _TrajectoryCsvPlan:
+def _csv_plan(source: LogSource) -> _CsvPlan:
     options = options_of(source, TrajectoryCsvOptions)
     placement = level_placement(source, options.heading)
     crs = source.need_crs()
@@ -377,4 +377,4 @@ def _trajectory_csv_plan(source: LogSource) -> _TrajectoryCsvPlan:
     stamps = StampColumn.of(source, source.path, layout, columns["time"])
     kinds: dict[str, Kind] = {found.column: "number" for found in columns.values()}
     kinds |= stamps.kinds
-    return _TrajectoryCsvPlan(layout, columns, crs, kinds, stamps, placement)
+    return _CsvPlan(layout, columns, crs, kinds, stamps, placement)

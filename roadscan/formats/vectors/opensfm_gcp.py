@@ -178,7 +178,7 @@ class OpensfmPoints(LogFormat):
             if not seen:
                 yield Reject("the point has no observations", record)
                 continue
-            placed = [_opensfm_points_place(one, sizes) for one in seen]
+            placed = [_pixel(one, sizes) for one in seen]
             unknown = sum(place is None for place in placed)
             if unknown:
                 yield Reject(f"{_NO_SIZE}, of {unknown} of the point's pictures", record)
@@ -209,7 +209,7 @@ class _Sizes:
         return self._known[name]
 
 
-def _opensfm_points_place(seen: dict[str, Any], sizes: _Sizes) -> tuple[float, float] | None:
+def _pixel(seen: dict[str, Any], sizes: _Sizes) -> tuple[float, float] | None:
     """Return u, v (pixels) of an observation, NaN where there is none; None where the picture's size is not known."""
     size = sizes.of(str(seen.get("shot_id", "")))
     if size is None:

@@ -17,10 +17,11 @@ from typing import Final, Protocol
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.core.errors import FormatError
+from roadscan.core.errors import FormatError, brief
 from roadscan.store.codecs.parquet.foreign_pages import ParquetPages
 from roadscan.store.damage import UNREADABLE
 
+_SUFFIXES: Final = (".parquet", ".arrow", ".feather", ".ipc")
 _MAPPED_CHUNKS: Final = 8
 """Chunks of a mapped file after which its pages are released."""
 _LARGE_FILE_BYTES: Final = 32 << 20  # larger files are read through a buffer
@@ -175,15 +176,24 @@ def need_table(file: Path) -> ColumnTable:
         raise FormatError(f"the file is damaged: {brief(error)}", expected="Arrow IPC or Parquet", file=file) from error
 
 
+def table_files(path: Path) -> list[Path]:
+    """Return the file, or all Parquet and Arrow files of the folder by name."""
+    if not path.is_dir():
+        return [path]
+    return sorted(p for p in path.rglob("*") if p.suffix.lower() in _SUFFIXES and p.is_file())
+
+
+def schema_or_none(file: Path) -> pa.Schema | None:
+    """Return the schema of a file, None where it cannot be read."""
+    try:
+        return open_table(file).schema
+    except (*UNREADABLE, FormatError):
+        return None
+
+
 def is_number(kind: pa.DataType) -> bool:
     """Return True for a column of integers or floating-point numbers."""
     return bool(pa.types.is_integer(kind) or pa.types.is_floating(kind))
-
-
-def brief(error: BaseException) -> str:
-    """Return the first line of an error's text."""
-    text = str(error).strip().splitlines()
-    return text[0][:200] if text else type(error).__name__
 
 
 _FIRST_MESSAGE = 8

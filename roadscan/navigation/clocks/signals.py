@@ -247,8 +247,6 @@ _WINDOW_OF_TOTALS_S: Final = (6.0, 30.0)
 """Shortest and longest window of totals; within it, the gyroscopes' bias and a counter's zero are constant."""
 _FULL: Final = 0.3
 """A window with a smaller share of the samples of the fullest is left out."""
-_WINDOWS_GAP: Final = 5.0
-"""Samples farther apart than this many usual intervals leave a gap."""
 _APART_S: Final = 2.0
 """The random walk of the residuals is estimated over this time."""
 _ANSWER: Final = 0.05
@@ -374,7 +372,7 @@ class _Samples:
         away with it. Nothing is carried over a gap; after one, the level is that of the first samples.
         """
         steps = np.diff(self.since_s)
-        parts = np.split(np.arange(self.since_s.size), np.flatnonzero(steps > _WINDOWS_GAP * np.median(steps)) + 1)
+        parts = np.split(np.arange(self.since_s.size), np.flatnonzero(steps > _GAP * np.median(steps)) + 1)
         level_of = max(1, round(1.0 / (1.0 - keep)))
 
         def white(values: Float64) -> Float64:

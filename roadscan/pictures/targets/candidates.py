@@ -225,7 +225,7 @@ _MOST_M: Final = 6.0
 """Farthest distance from a target's stated place, in its own plane, that is searched (m)."""
 _SCALES: Final = (0.88, 1.0, 1.14)
 """Sizes of shapes that are compared, as shares of the stated one: distances are off, too."""
-_CANDIDATES_TURNS_DEG: Final = (
+_IN_PLANE_DEG: Final = (
     0.0,
     22.5,
     45.0,
@@ -304,7 +304,7 @@ class _Straight:
 
     def matches(self, shape: Shape) -> Iterator[Candidate]:
         """Yield the best places of a shape."""
-        turns = _CANDIDATES_TURNS_DEG if shape.style == "checker" else (0.0,)
+        turns = _IN_PLANE_DEG if shape.style == "checker" else (0.0,)
         best: list[tuple[float, float, float, float, float]] = []
         for scale in _SCALES:
             for turn in turns:

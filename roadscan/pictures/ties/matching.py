@@ -164,7 +164,7 @@ _STEPS: Final = 12  # Rounds of re-weighting from the width of the band down to 
 _NOISE_PX: Final = 1.0
 """1 σ of the place of a feature across the epipolar line (px), for the last rounds."""
 _WITHIN: Final = 3.0  # A match lies within so many σ of the epipolar line, in the end.
-_MATCHING_LEAST: Final = 12
+_LEAST_MATCHES: Final = 12
 """Matches of two pictures, at least: with fewer, chance agrees as well with five unknowns."""
 _LEAST_BASE_M: Final = 1e-3
 """Two pictures that were taken nearer to each other (m) have no epipolar lines."""
@@ -210,12 +210,12 @@ def matches(
     sigma = float(np.hypot(relative.sigma_turn_rad, min(relative.sigma_direction_rad, _LOOSEST_RAD)))
     band = _WITHIN * (sigma + _NOISE_PX * pixel_rad)
     pairs = _alike(first, second, relative, band)
-    if len(pairs) < _MATCHING_LEAST:
+    if len(pairs) < _LEAST_MATCHES:
         return none, len(pairs)
     rays = first[0][pairs[:, 0]], second[0][pairs[:, 1]]
     away = _fitted(rays, relative, band, _NOISE_PX * pixel_rad)
     kept = np.abs(away) <= _WITHIN * _NOISE_PX * pixel_rad
-    found = pairs[kept] if int(kept.sum()) >= _MATCHING_LEAST else none
+    found = pairs[kept] if int(kept.sum()) >= _LEAST_MATCHES else none
     return found, len(pairs) - len(found)
 
 

@@ -358,8 +358,6 @@ _COMMENT: Final = b"\xff\xfe"
 _EXIF: Final = b"Exif\0\0"
 _XMP: Final = b"http://ns.adobe.com/xap/1.0/\0"
 _LARGEST: Final = 0xFFFF - 2  # Bytes that a segment can hold.
-_JPEG_SEGMENTS_WITHOUT_LENGTH: Final = (0x01, *range(0xD0, 0xD9))  # Markers that no length follows.
-_JPEG_SEGMENTS_SCAN: Final = 0xDA  # The marker after which the picture's data follow.
 
 
 def with_tags(jpeg: bytes, exif: bytes, xmp: bytes) -> bytes:
@@ -412,15 +410,15 @@ def _without_tags(jpeg: bytes) -> bytes:
     """Return what follows the start of a JPEG without its segments of EXIF and XMP."""
     kept, at = bytearray(), 2
     while at + 4 <= len(jpeg):
-        if jpeg[at] != 0xFF:
+        if jpeg[at] != _FILL:
             raise ValueError(f"no segment begins at byte {at}")
         marker = jpeg[at + 1]
-        if marker == _JPEG_SEGMENTS_SCAN:
+        if marker == _SCAN:
             break
-        if marker == 0xFF:  # a fill byte
+        if marker == _FILL:
             at += 1
             continue
-        if marker in _JPEG_SEGMENTS_WITHOUT_LENGTH:
+        if marker in _WITHOUT_LENGTH and marker != _END:
             kept += jpeg[at : at + 2]
             at += 2
             continue

@@ -221,7 +221,7 @@ def parse_columns(text: str) -> TextColumns:
     """
     lines = _with_points(text.splitlines())
     first = next(
-        (k for k, line in enumerate(lines) if _profile_text_numbers(_cells(line, _separator(line))) is not None), None
+        (k for k, line in enumerate(lines) if _numbers_of_line(_cells(line, _separator(line))) is not None), None
     )
     if first is None:
         raise FormatError("no line with two numbers", expected="a station and a height to a line")
@@ -231,7 +231,7 @@ def parse_columns(text: str) -> TextColumns:
     for number, line in enumerate(lines[first:], first + 1):
         if not line.strip():
             continue
-        values = _profile_text_numbers(_cells(line, separator))
+        values = _numbers_of_line(_cells(line, separator))
         if values is None or len(values) != width:
             rejects.append((number, line.strip()[:60]))
         else:
@@ -286,7 +286,7 @@ def _cells(line: str, separator: str | None) -> list[str]:
     return cells[:-1] if separator is not None and len(cells) > 2 and not cells[-1] else cells
 
 
-def _profile_text_numbers(cells: Sequence[str]) -> list[float] | None:
+def _numbers_of_line(cells: Sequence[str]) -> list[float] | None:
     """Return the numbers of a line, NaN for missing ones; None for a line of fewer than two numbers."""
     if len(cells) < 2 or cells[0].lower() in _MISSING:
         return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,9 +12,8 @@ import typer
 from roadscan.cli.terminal import print_table
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from roadscan.condition.profiles.profile_files import ProfileFile
+    from roadscan.condition.profiles.tables import ProfileTable
 
 ProfileArgument = Annotated[
     Path, typer.Argument(metavar="FILE", help="ERD, or columns of text: a station and heights to a line.",
@@ -51,11 +51,11 @@ def iri(
     read = _read(file, x_unit, height_unit, columns)
     try:
         if localised is None:
-            found = tables.iri(
+            found = tables.iri_table(
                 read.x_m, read.height_m, segment_m=segment, stations_m=_numbers(stations), names=read.names
             )
         else:
-            found = tables.localised_roughness(read.x_m, read.height_m, localised)
+            found = tables.localised_table(read.x_m, read.height_m, localised)
     except RoadscanError as error:
         raise error.at(file, error.record) from error
     _show(found, read, file, as_json)
@@ -79,7 +79,7 @@ def mpd(
 
     read = _read(file, x_unit, height_unit, columns)
     try:
-        found = tables.mpd(read.x_m, read.height_m, segment_m=segment, from_m=from_m, to_m=to_m)
+        found = tables.mpd_table(read.x_m, read.height_m, segment_m=segment, from_m=from_m, to_m=to_m)
     except RoadscanError as error:
         raise error.at(file, error.record) from error
     _show(found, read, file, as_json)
@@ -108,17 +108,25 @@ def _numbers(text: str | None) -> list[float] | None:
         raise ConfigError(f"--stations {text}", expected="numbers with commas between them") from None
 
 
-def _show(found: pd.DataFrame, read: ProfileFile, file: Path, as_json: bool) -> None:
-    told_of = found.attrs["findings"]
-    for one in told_of:
+def _show(found: ProfileTable, read: ProfileFile, file: Path, as_json: bool) -> None:
+    for one in found.findings:
         typer.echo(f"{'left out' if one.left_out else 'doubtful'}: {file}: {one.line}", err=True)
-    rows: list[dict[str, Any]] = json.loads(found.to_json(orient="records", double_precision=9))
+    names = tuple(found.columns)
+    rows = list(zip(*(map(_plain, found.columns[name]) for name in names), strict=True))
     if as_json:
         told = {"file": str(file), "profiles": list(read.names), "rejected_lines": len(read.rejects),
-                "findings": [vars(one) for one in told_of], "rows": rows}  # fmt: skip
+                "findings": [vars(one) for one in found.findings],
+                "rows": [dict(zip(names, row, strict=True)) for row in rows]}  # fmt: skip
         typer.echo(json.dumps(told, indent=2, ensure_ascii=False))
         return
-    print_table(tuple(found.columns), [tuple(_cell(name, row[name]) for name in found.columns) for row in rows])
+    print_table(names, [tuple(map(_cell, names, row)) for row in rows])
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON has it: None for NaN, nine decimals."""
+    if isinstance(value, float):
+        return round(float(value), 9) if math.isfinite(value) else None
+    return value if isinstance(value, str) else int(value)
 
 
 def _cell(name: str, value: Any) -> str:

@@ -8,7 +8,6 @@ import pyarrow as pa
 
 from roadscan.core.errors import RoadscanError, StoreError
 from roadscan.core.survey import Survey
-from roadscan.navigation.tasks.navigate import known_keys
 from roadscan.store.asset_schema import asset_tables
 from roadscan.store.query.sql import Limits, missing_table, query
 from roadscan.store.schema import schema_names
@@ -42,7 +41,12 @@ def ask(
     """
     try:
         return query(
-            store, statement, known_keys(survey, store), damaged, unconfined=unconfined, limits=limits or Limits()
+            store,
+            statement,
+            lambda: _known_keys(survey, store),
+            damaged,
+            unconfined=unconfined,
+            limits=limits or Limits(),
         )
     except RoadscanError as error:
         name = missing_table(error.__cause__)
@@ -50,6 +54,12 @@ def ask(
         if told is None:
             raise
         raise told from error
+
+
+def _known_keys(survey: Survey, store: Store) -> list[str]:
+    from roadscan.navigation.tasks.navigate import known_keys
+
+    return known_keys(survey, store)
 
 
 def not_made(name: str, survey: Survey) -> RoadscanError | None:

@@ -7,6 +7,7 @@ import random
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import duckdb
 import laspy
@@ -29,7 +30,7 @@ from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.store.logs import read_log_records
 from roadscan.store.manifest import Manifest
-from roadscan.store.query.sql import query
+from roadscan.store.query.sql import connect, query
 from roadscan.store.store import Store
 from roadscan.survey.status import survey_status, verify_store
 from roadscan.tiles.blocks import Block
@@ -500,6 +501,38 @@ def test_a_damaged_or_missing_product_is_made_again(finished: Simulated, tmp_pat
     assert survey_status(Session(survey, store)).is_complete
     assert verify_store(store) == []
     assert_same_files(finished.store(), store)
+
+
+def test_a_statement_of_tables_that_a_run_made_opens_no_log(finished: Simulated) -> None:
+    """The same answers as with all views; who reads a log's table, a macro or the list of tables gets all of them."""
+    store, asked = finished.store(), []
+
+    def logs() -> list[str]:
+        asked.append(1)
+        return [record.key for record in read_log_records(store)]
+
+    def answer(statement: str) -> list[dict[str, Any]]:
+        asked.clear()
+        return query(store, statement, logs).to_pylist()
+
+    with connect(store) as connection:
+        everything = {
+            statement: connection.sql(statement).to_arrow_table().to_pylist()
+            for statement in (
+                "WITH a AS (SELECT * FROM cells) SELECT count(*), max(points) FROM a, tiles",
+                "SELECT (SELECT count(*) FROM tiles) FROM footprints LIMIT 1",
+            )
+        }
+        views = connection.sql("SELECT view_name FROM duckdb_views() WHERE NOT internal ORDER BY 1").fetchall()
+    for statement, rows in everything.items():
+        assert answer(statement) == rows
+        assert not asked
+    assert answer("SELECT count(*) AS n FROM trajectory")[0]["n"] > 0
+    assert asked
+    answer("SELECT count(*) FROM tiles, trajectory_between(0, 1)")
+    assert asked
+    listed = answer("SELECT DISTINCT view_name FROM tiles, duckdb_views() WHERE NOT internal ORDER BY 1")
+    assert [row["view_name"] for row in listed] == [name for (name,) in views]
 
 
 def test_sql_shows_the_logs_of_the_survey_only(finished: Simulated, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ depths of valid segments. How a profile is made ready, and what that was taken f
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +39,23 @@ from roadscan.core.witness import Finding
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+class ProfileTable(NamedTuple):
+    """Figures of a profile, and what was noticed in it."""
+
+    columns: dict[str, Sequence[Any] | npt.NDArray[Any]]
+    """Values by column, a row a stretch."""
+    findings: list[Finding]
+    """What was left out, and what is doubtful."""
+
+    def frame(self) -> pd.DataFrame:
+        """Return the table for Python, with the findings in `attrs["findings"]`."""
+        import pandas as pd  # 0.15 s, which the command line goes without
+
+        table = pd.DataFrame(self.columns)
+        table.attrs["findings"] = self.findings
+        return table
 
 
 FLATTEST_M_PER_KM = 0.1
@@ -87,13 +104,23 @@ def iri(
     ProfileError
         where stations do not ascend, or a profile cannot be judged: too coarse, too short, or no road.
     """
-    import pandas as pd
+    return iri_table(x_m, height_m, segment_m=segment_m, stations_m=stations_m, names=names).frame()
 
+
+def iri_table(
+    x_m: npt.ArrayLike,
+    height_m: npt.ArrayLike,
+    *,
+    segment_m: float | None = None,
+    stations_m: Sequence[float] | None = None,
+    names: Sequence[str] = (),
+) -> ProfileTable:
+    """Return what :func:`iri` does, as columns."""
     on, sound = _sound_ride(x_m, height_m)
     heights = np.stack([one.height_m for one in sound])
     parts = segments_of(on.x_m[0], on.x_m[-1], segment_m, stations_m)
     found, shares = iri_of(on, parts)
-    columns: dict[str, npt.ArrayLike] = {"from_m": parts.from_m, "to_m": parts.to_m}
+    columns: dict[str, Sequence[Any] | npt.NDArray[Any]] = {"from_m": parts.from_m, "to_m": parts.to_m}
     labels = list(names) or [str(k + 1) for k in range(len(heights))]
     for label, values in zip(labels, found, strict=True):
         columns["iri_m_per_km" if len(heights) == 1 else f"iri_{label}_m_per_km"] = values
@@ -109,7 +136,6 @@ def iri(
         ", ".join(filter(None, (note, *_left_out(on.x_m, sound, parts, k), "coarse" * bool(coarse[k]))))
         for k, note in enumerate(_joined(on, parts, segment_m, found))
     ]
-    table = pd.DataFrame(columns)
     told = _findings(on.x_m, sound, labels)
     if coarse.any():
         told += [
@@ -121,8 +147,7 @@ def iri(
             for whose, one, own in zip(_whose(labels), sound, rounding, strict=True)
             if (own > NOTABLE * found).any()
         ]
-    table.attrs["findings"] = told
-    return table
+    return ProfileTable(columns, told)
 
 
 def localised_roughness(
@@ -141,8 +166,13 @@ def localised_roughness(
     A row a stretch: from_m, to_m, peak_station_m, peak_m_per_km and note: `step` where one of more than 0.1 m lies in
     it. A step of more than 0.5 m has a row without a peak and with the note `jump`: the car does not roll over it.
     """
-    import pandas as pd
+    return localised_table(x_m, height_m, limit_m_per_km, length_m=length_m).frame()
 
+
+def localised_table(
+    x_m: npt.ArrayLike, height_m: npt.ArrayLike, limit_m_per_km: float, *, length_m: float = LOCAL_M
+) -> ProfileTable:
+    """Return what :func:`localised_roughness` does, as columns."""
     if not np.isfinite(limit_m_per_km):
         raise ProfileError(f"a limit of {limit_m_per_km} m/km", expected="a finite number")
     on, sound = _sound_ride(x_m, height_m)
@@ -155,11 +185,13 @@ def localised_roughness(
         rows.append((one.from_m, one.to_m, one.peak_m, one.peak, "step" if stepped else ""))
     jumps = np.unique(np.concatenate([broken.jump_m for broken in on.breaks]))
     rows += [(at - half, at + half, at, np.nan, "jump") for at in jumps.tolist()]
-    names = ["from_m", "to_m", "peak_station_m", "peak_m_per_km"]
-    table = pd.DataFrame(rows, columns=[*names, "note"]).astype(dict.fromkeys(names, float))
-    table = table.sort_values("from_m", kind="stable", ignore_index=True)
-    table.attrs["findings"] = _findings(on.x_m, sound, [str(k + 1) for k in range(len(sound))])
-    return table
+    rows.sort(key=lambda row: row[0])
+    names = ("from_m", "to_m", "peak_station_m", "peak_m_per_km")
+    columns: dict[str, Sequence[Any] | npt.NDArray[Any]] = {
+        name: np.array([row[k] for row in rows], float) for k, name in enumerate(names)
+    }
+    columns["note"] = [row[-1] for row in rows]
+    return ProfileTable(columns, _findings(on.x_m, sound, [str(k + 1) for k in range(len(sound))]))
 
 
 def mpd(
@@ -194,8 +226,19 @@ def mpd(
     ProfileError
         where stations do not ascend, or the profile is too coarse, too short or no texture.
     """
-    import pandas as pd
+    return mpd_table(x_m, height_m, segment_m=segment_m, from_m=from_m, to_m=to_m, settings=settings).frame()
 
+
+def mpd_table(
+    x_m: npt.ArrayLike,
+    height_m: npt.ArrayLike,
+    *,
+    segment_m: float | None = None,
+    from_m: float | None = None,
+    to_m: float | None = None,
+    settings: TextureSettings | None = None,
+) -> ProfileTable:
+    """Return what :func:`mpd` does, as columns."""
     if segment_m is not None and not (0.1 <= segment_m < np.inf and abs((segment_m + 0.05) % 0.1 - 0.05) < 1e-7):
         raise ProfileError(f"stretches of {segment_m:g} m", expected="a multiple of the 0.1 m of a segment")
     x = stations_of(x_m)
@@ -230,10 +273,8 @@ def mpd(
         notes += ["flat"] if depth.mpd_mm < FLATTEST_MM else []
         rows.append((first, last, depth.mpd_mm, depth.stdev_mm, rms_texture_mm(inside), depth.valid, depth.segments,
                      ", ".join(notes)))  # fmt: skip
-    names = ["from_m", "to_m", "mpd_mm", "stdev_mm", "rms_mm", "valid_segments", "segments", "note"]
-    table = pd.DataFrame(rows, columns=names)
-    table.attrs["findings"] = told
-    return table
+    names = ("from_m", "to_m", "mpd_mm", "stdev_mm", "rms_mm", "valid_segments", "segments", "note")
+    return ProfileTable(dict(zip(names, map(list, zip(*rows, strict=True)), strict=True)), told)
 
 
 def _sound_ride(x_m: npt.ArrayLike, height_m: npt.ArrayLike) -> tuple[Ride, list[SoundHeights]]:

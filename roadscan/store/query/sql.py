@@ -8,7 +8,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final, Protocol, TypeAlias
 
 import duckdb
 import pyarrow as pa
@@ -20,7 +20,7 @@ from roadscan.store.logs import log_of, read_log_records, table_of
 from roadscan.store.manifest import Manifest
 from roadscan.store.query.sql_files import PROTOCOL, OpenedFiles, StoreFiles, url
 from roadscan.store.readings.packed_returns import PACKED, beams_query, returns_query
-from roadscan.store.schema import schema_names, table_schema
+from roadscan.store.schema import table_locations, table_schema
 from roadscan.store.store import Store
 from roadscan.store.verified import faults_of_opened, recorded_files
 
@@ -55,7 +55,16 @@ _SPILT: Final = 4
 """An unconfined statement may write so many times its memory to a temporary folder, which ends with it."""
 _BATCH_ROWS: Final = 100_000
 """Rows of an answer that are fetched at once."""
+_ONLY_NAMES: Final[dict[str, str | bool | int | float | list[str]]] = {
+    "enable_external_access": False,
+    "python_enable_replacements": False,
+    "threads": 1,
+}
+"""A connection that reads the names of a statement's tables, and no file."""
 _WAY_OUT_OF_STORE = "`--unconfined` (in Python `unconfined=True`) lets a statement reach other files"
+
+ShownLogs: TypeAlias = Iterable[str] | Callable[[], Iterable[str]] | None
+"""Keys of the logs to show, or what finds them where a statement reads a table of logs; None: all in the store."""
 
 
 @dataclass(frozen=True)
@@ -134,15 +143,17 @@ def connect(
 
 def _opened(
     store: Store | Stores,
-    logs: Iterable[str] | None,
+    logs: ShownLogs,
     damaged: list[StoreError] | None,
     unconfined: bool,
     limits: Limits,
+    statement: str | None = None,
 ) -> Opened:
     connection = duckdb.connect()
     try:
         if isinstance(store, Store):
-            opened = _with_views(connection, store, logs, damaged)
+            tables = None if statement is None else _made_tables_of(store, statement, damaged)
+            opened = _with_views(connection, store, tables or tables_of(store, logs, damaged), damaged)
         else:
             opened = store.with_views(connection, damaged)
         connection.execute(f"SET memory_limit = '{limits.memory_words()}'")
@@ -156,10 +167,10 @@ def _opened(
     return opened
 
 
-def tables_of(store: Store, logs: Iterable[str] | None, damaged: list[StoreError] | None) -> Tables:
+def tables_of(store: Store, logs: ShownLogs, damaged: list[StoreError] | None) -> Tables:
     """Return the files of a store's tables; `logs` are the keys of those to show, all where None."""
     of_logs: dict[str, list[str]] = {}
-    wanted = None if logs is None else set(logs)
+    wanted = None if logs is None else set(logs() if callable(logs) else logs)
     records = read_log_records(store, damaged=damaged)
     for record in records:
         if wanted is not None and record.key not in wanted:
@@ -167,12 +178,37 @@ def tables_of(store: Store, logs: Iterable[str] | None, damaged: list[StoreError
         for file in (file for own in record.tables.values() for file in own):
             of_logs.setdefault(table_of(file.path), []).append(url(store, file.path))
     manifest = Manifest(store, damaged)
-    places = {name: location for name in schema_names() if (location := table_schema(name).location) is not None}
-    made_of = {name: store.files(folder, ".parquet") for name, folder in places.items()}
+    return Tables(of_logs, _made_files(store), manifest.table(), recorded_files(store, records, manifest))
+
+
+def _made_files(store: Store) -> dict[str, list[str]]:
+    """Return the URLs of the files of each table that a run made."""
+    made_of = {name: store.files(folder, ".parquet") for name, folder in table_locations().items()}
     assets = store.files(ASSET_FOLDER, ".parquet")
     made_of |= {name: [path] for name in asset_tables() if (path := f"{ASSET_FOLDER}/{name}.parquet") in assets}
-    made = {name: [url(store, f) for f in found] for name, found in made_of.items() if found}
-    return Tables(of_logs, made, manifest.table(), recorded_files(store, records, manifest))
+    return {name: [url(store, f) for f in found] for name, found in made_of.items() if found}
+
+
+def _made_tables_of(store: Store, statement: str, damaged: list[StoreError] | None) -> Tables | None:
+    """Return the tables that a statement reads where a run made all of them; None where it reads others.
+
+    A statement of cells needs neither the logs of the survey file nor the views of 20 other tables.
+    """
+    if "duckdb_" in statement.lower():  # duckdb_views() and its like list all tables, and are no table themselves
+        return None
+    try:
+        with duckdb.connect(config=_ONLY_NAMES) as connection:
+            names = connection.get_table_names(statement)
+    except duckdb.Error:  # a table macro, a fault of the statement: reported by the connection that has all views
+        return None
+    if not names:
+        return None
+    made = _made_files(store)
+    if not names <= made.keys():
+        return None
+    manifest = Manifest(store, damaged)
+    read = {name: made[name] for name in sorted(names)}
+    return Tables({}, read, manifest.table(), recorded_files(store, [], manifest))
 
 
 def statements_of(of_logs: Mapping[str, list[str]]) -> dict[str, str]:
@@ -191,13 +227,12 @@ def statements_of(of_logs: Mapping[str, list[str]]) -> dict[str, str]:
 
 
 def _with_views(
-    connection: duckdb.DuckDBPyConnection, store: Store, logs: Iterable[str] | None, damaged: list[StoreError] | None
+    connection: duckdb.DuckDBPyConnection, store: Store, tables: Tables, damaged: list[StoreError] | None
 ) -> Opened:
     own_files = StoreFiles(store)
     connection.register_filesystem(own_files)
     add_utc(connection)
     shut: dict[str, StoreError] = {}
-    tables = tables_of(store, logs, damaged)
     for table, rows in statements_of(tables.of_logs).items():
         fault = add_view(connection, own_files, table, rows, damaged)
         if fault is not None:
@@ -230,7 +265,7 @@ def add_span_macro(connection: duckdb.DuckDBPyConnection, table: str) -> None:
 def query(
     store: Store | Stores,
     statement: str,
-    logs: Iterable[str] | None = None,
+    logs: ShownLogs = None,
     damaged: list[StoreError] | None = None,
     *,
     unconfined: bool = False,
@@ -246,7 +281,7 @@ def query(
     RoadscanError
         where the statement fails, or takes more time or memory than the `limits` allow.
     """
-    opened = _opened(store, logs, damaged, unconfined, limits)
+    opened = _opened(store, logs, damaged, unconfined, limits, statement)
     with opened.connection as connection, tempfile.TemporaryDirectory(prefix="roadscan-sql-") as folder:
         if unconfined:
             connection.execute(f"SET temp_directory = '{folder}'")

@@ -15,7 +15,7 @@ import pytest
 from roadscan.core.crs import MapFrame
 from roadscan.core.grid import LanePass, PassId, RunId, TileGrid, TileId
 from roadscan.georeference.cloud import TilePoints
-from roadscan.tiles.cells import TileCells
+from roadscan.tiles.cells import CellValues, TileCells
 from roadscan.tiles.product import ProductContext, Tile, TileSummary
 
 Surface = Callable[[npt.NDArray[np.float64], npt.NDArray[np.float64]], npt.NDArray[np.float64]]
@@ -160,6 +160,24 @@ class Workshop:
 
 
 @dataclass
+class CellsInMemory:
+    """Cells for products over many tiles, and a count of how often each tile was asked for."""
+
+    tiles: dict[TileId, Tile]
+    loads: dict[TileId, int]
+
+    def __call__(self, tile: TileId) -> TileCells | None:
+        if tile not in self.tiles:
+            return None
+        self.loads[tile] += 1
+        return self.tiles[tile].cells
+
+    def values(self, tile: TileId, name: str) -> CellValues | None:
+        cells = self(tile)
+        return None if cells is None else CellValues.of(cells, name)
+
+
+@dataclass
 class SmallSurvey:
     """Tiles in memory, and a count of how often each was asked for."""
 
@@ -170,11 +188,9 @@ class SmallSurvey:
     def __post_init__(self) -> None:
         self.loads: dict[TileId, int] = dict.fromkeys(self.tiles, 0)
 
-    def load_cells(self, tile: TileId) -> TileCells | None:
-        if tile not in self.tiles:
-            return None
-        self.loads[tile] += 1
-        return self.tiles[tile].cells
+    @property
+    def load_cells(self) -> CellsInMemory:
+        return CellsInMemory(self.tiles, self.loads)
 
     @property
     def summaries(self) -> list[TileSummary]:

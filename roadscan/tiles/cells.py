@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -48,6 +49,22 @@ class TileCells:
         image = np.full((self.cells_per_edge, self.cells_per_edge), np.nan, dtype=np.float32)
         image[self.cells_per_edge - 1 - self.row.astype(np.int64), self.column] = getattr(self, name)
         return image
+
+
+class CellValues(NamedTuple):
+    """One column of a tile's cells; arrays are (n,), in the order of :class:`TileCells`."""
+
+    cells_per_edge: int
+    column: npt.NDArray[np.uint16]
+    """Column counted from the west edge."""
+    row: npt.NDArray[np.uint16]
+    """Row counted from the south edge."""
+    values: npt.NDArray[Any]
+
+    @classmethod
+    def of(cls, cells: TileCells, name: str) -> CellValues:
+        """Return a column, by its name, of cells in memory."""
+        return cls(cells.cells_per_edge, cells.column, cells.row, getattr(cells, name))
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from roadscan.tiles.kernels.bucket_statistics import bucket_points, finish_bucke
 from roadscan.tiles.kernels.cell_columns import CellColumns, select_arrays, statistics_of_full
 from roadscan.tiles.kernels.cell_statistics import AHEAD, find_groups, finish_cells
 from roadscan.tiles.kernels.decimate import Cells
-from roadscan.tiles.kernels.grey_pictures import grey_intensity, shade_cells
+from roadscan.tiles.kernels.grey_pictures import grey_intensity, shade_cells, shade_raster
 from roadscan.tiles.kernels.pool import Pool
 from roadscan.tiles.kernels.pyramid import Levels, Pixels, reduce_cells
 from roadscan.tiles.kernels.row_buckets import (
@@ -244,9 +244,13 @@ def test_shade_of_a_slope_is_lamberts() -> None:
         column, row, 100.0 + 0.5 * column, 100.0, np.float32(1 / 8), *light, 0, 3, np.zeros((3, 7), np.float32), picture
     )  # fmt: skip
     bright = (0.5 * np.sqrt(0.5) + np.sqrt(0.5)) / np.sqrt(1.25)
-    away = np.abs(picture.astype(int) - (1 + 254 * bright))
-    away[[0, 0, -1, -1], [0, -1, 0, -1]] = 0  # there two of the eight neighbours and their opposites are missing
-    assert away.max() <= 1
+    whole, heights = np.zeros((4, 5), np.uint8), np.full((6, 7), np.nan)
+    heights[1:-1, 1:-1] = 100.0 + 0.5 * np.arange(5)
+    shade_raster(heights, 1 / 8, 1 / 8, *map(float, light), whole)
+    for one in (picture, whole):
+        away = np.abs(one.astype(int) - (1 + 254 * bright))
+        away[[0, 0, -1, -1], [0, -1, 0, -1]] = 0  # there two of the eight neighbours and their opposites are missing
+        assert away.max() <= 1
 
 
 @pytest.mark.parametrize("cover", [1.0, 0.2])

@@ -33,7 +33,6 @@ from roadscan.tiles.products.hillshade import (
     SHADE_BAND,
     HillshadeOptions,
     shade,
-    shade_in_strips,
     with_empty_rim,
     with_neighbours,
 )
@@ -127,7 +126,7 @@ def _write_sheet(
             left, top, width, height = files.place(tile, box)
             around = files.heights_around(tile, known)
             empty = np.zeros((height, width), np.uint8)
-            yield left, top, empty if around is None else shade_in_strips(around, east, light, north)
+            yield left, top, empty if around is None else shade(around, east, light, north)
 
     write_sparse_cog(
         path,
@@ -152,7 +151,7 @@ def _write_picture(output: Output, files: SurfaceFiles, options: HillshadeOption
     if not pixels.count.any():
         raise StoreError("no tile of the survey has a surface", change="look at the settings of [surface]")
     around = with_empty_rim(pixels.trimmed())
-    write_picture(path, shade_in_strips(around, right * east, options, down * north))
+    write_picture(path, shade(around, right * east, options, down * north))
 
 
 def _add(pixels: MeanPixels, heights_m: Pixels, place: tuple[int, int, int, int]) -> None:

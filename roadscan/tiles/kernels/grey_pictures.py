@@ -37,8 +37,12 @@ def continued(near, opposite, centre):
 
 
 @inlined
-def shade_line(south, here, north, slope_scale, light_east, light_north, light_up, line):
-    """Shade one line of cells; all three lines have one more cell on either side, NaN where unknown."""
+def shade_line(south, here, north, east_scale, north_scale, light_east, light_north, light_up, line):
+    """Shade one line of cells; all three lines have one more cell on either side, NaN where unknown.
+
+    The brightness of a matt surface: the cosine between its normal and the direction of the light. Slopes are the
+    weighted differences of Horn, *Hill shading and the reflectance map* (Proc. IEEE 69, 1981), with weights 1, 2, 1.
+    """
     for k in range(line.size):
         centre = here[k + 1]
         sw = continued(south[k], north[k + 2], centre)
@@ -49,11 +53,29 @@ def shade_line(south, here, north, slope_scale, light_east, light_north, light_u
         nw = continued(north[k], south[k + 2], centre)
         n = continued(north[k + 1], south[k + 1], centre)
         ne = continued(north[k + 2], south[k], centre)
-        east = ((ne + TWO * e + se) - (nw + TWO * w + sw)) * slope_scale
-        up = ((nw + TWO * n + ne) - (sw + TWO * s + se)) * slope_scale
+        east = ((ne + TWO * e + se) - (nw + TWO * w + sw)) * east_scale
+        up = ((nw + TWO * n + ne) - (sw + TWO * s + se)) * north_scale
         towards = light_up - (light_east * east + light_north * up)
         bright = max(towards / np.sqrt(ONE + east * east + up * up), np.float32(0.0))
         line[k] = np.uint8(DARKEST + STEPS * bright) if not np.isnan(centre) else EMPTY
+
+
+@kernel
+def shade_raster(heights, east_scale, north_scale, light_east, light_north, light_up, picture):
+    """Draw shaded relief of a raster, both north up.
+
+    Parameters
+    ----------
+    heights : (rows + 2, columns + 2) float64, m, NaN where unknown.
+    east_scale, north_scale : float64, exaggeration / (8 · edge of a cell in m) towards each.
+    light_east, light_north, light_up : float64, unit vector towards the light.
+    picture : (rows, columns) uint8, out.
+    """
+    for line in range(picture.shape[0]):
+        shade_line(
+            heights[line + 2], heights[line + 1], heights[line], east_scale, north_scale, light_east, light_north,
+            light_up, picture[line],
+        )  # fmt: skip
 
 
 @kernel
@@ -84,6 +106,6 @@ def shade_cells(
             at += 1
         if line >= 0:
             shade_line(
-                heights[(line + 2) % 3], heights[line % 3], above, slope_scale, light_east, light_north, light_up,
-                picture[rows - 1 - line],
+                heights[(line + 2) % 3], heights[line % 3], above, slope_scale, slope_scale, light_east, light_north,
+                light_up, picture[rows - 1 - line],
             )  # fmt: skip

@@ -15,7 +15,7 @@ from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.digest import file_digest
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.store import Store
-from roadscan.tiles.cells import TileCells
+from roadscan.tiles.cells import CellValues, TileCells
 from roadscan.tiles.drives import Drives
 from roadscan.tiles.lane_direction import LaneDirections
 from roadscan.tiles.product import (
@@ -26,7 +26,7 @@ from roadscan.tiles.product import (
     products,
 )
 from roadscan.tiles.pyramid import Level, pyramid_of
-from roadscan.tiles.tasks.cell_files import read_cells, read_overview
+from roadscan.tiles.tasks.cell_files import read_cells, read_overview, read_values
 from roadscan.tiles.tasks.tile_figures import tile_figures
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE
 from roadscan.tiles.tasks.wanted_products import product_context, product_key, wanted_products
@@ -151,6 +151,11 @@ class StoredTiles:
         """Return the cells of a tile; None where the survey has no such tile."""
         record = self._cells.get(str(tile))
         return None if record is None else read_cells(self._store, record, self._edge)
+
+    def values(self, tile: TileId, name: str) -> CellValues | None:
+        """Return one column of the cells of a tile; None where the survey has no such tile."""
+        record = self._cells.get(str(tile))
+        return None if record is None else read_values(self._store, record, self._edge, name)
 
     def file(self, product: str, tile: TileId) -> bytes | None:
         """Return the content of a tile's file of a surface product; None where there is none."""

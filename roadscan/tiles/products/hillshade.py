@@ -19,12 +19,12 @@ from roadscan.core.strict import Strict
 from roadscan.store.codecs.cog import Band
 from roadscan.store.codecs.grey_picture import check_picture
 from roadscan.store.codecs.tiff import raster_settings
+from roadscan.tiles.kernels.grey_pictures import shade_raster
 from roadscan.tiles.product import Cells, LoadCells, Output, ProductContext, SurveyProduct, TileSummary
 from roadscan.tiles.products.raster import CellBox, SparseRaster, cell_image, paste_tile
 from roadscan.tiles.products.relief_picture import PNG_SIGNATURE, MeanPixels, write_picture
 from roadscan.tiles.products.sheets import (
     Sheet,
-    cells_of,
     check_sheet,
     cut_sheets,
     dated,
@@ -32,13 +32,14 @@ from roadscan.tiles.products.sheets import (
     index_output,
     sheet_of,
     unknown_output,
+    values_in,
     write_index,
 )
 
 _STEM: Final = "hillshade"
 _PICTURE: Final = "hillshade.png"
+_HEIGHT: Final = "height_robust_m"  # Column of cells that is drawn.
 _EMPTY: Final = 0  # Grey of a pixel without a height.
-_STRIP_ROWS: Final = 128  # Rows that are shaded at a time, to save memory.
 SHADE_BAND: Final = Band("hillshade", "")
 
 
@@ -127,8 +128,8 @@ class Surface:
     def images(self) -> Iterator[tuple[TileId, Float64]]:
         """Yield tiles and their (rows, columns) heights above the base (m), NaN where no point lies; row by row."""
         for tile in sorted(self.tiles, key=lambda t: (-t.row, t.column)):
-            cells = cells_of(tile, self.load_cells)
-            yield tile, cell_image(cells, cells.height_robust_m - self.base_m, "float64")
+            cells = values_in(tile, _HEIGHT, self.load_cells)
+            yield tile, cell_image(cells, cells.values - self.base_m, "float64")
 
 
 class Light(Protocol):
@@ -147,78 +148,31 @@ class Light(Protocol):
         """Exaggeration of the heights."""
 
 
-def horn_slopes(heights_m: Float64, cell_m: float, cell_north_m: float | None = None) -> tuple[Float64, Float64]:
-    """Return slopes towards east and north of the inner cells of a north-up raster.
-
-    The weighted differences of Horn, *Hill shading and the reflectance map* (Proc. IEEE 69, 1981), eq. for
-    the third-order finite difference with weights 1, 2, 1. A missing neighbour is the continuation of the
-    opposite one through the centre, or level with the centre where that is missing too.
-
-    Parameters
-    ----------
-    heights_m : (rows + 2, columns + 2), NaN where unknown.
-    cell_m : edge of a cell (m); that towards east, where that towards north is stated.
-
-    Returns
-    -------
-    east, north : (rows, columns) metres a metre, NaN where the centre is unknown.
-    """
-    north_west, north, north_east = (_neighbour(heights_m, -1, c) for c in (-1, 0, 1))
-    west, east = _neighbour(heights_m, 0, -1), _neighbour(heights_m, 0, 1)
-    south_west, south, south_east = (_neighbour(heights_m, 1, c) for c in (-1, 0, 1))
-    to_east = (north_east + 2 * east + south_east) - (north_west + 2 * west + south_west)
-    to_north = (north_west + 2 * north + north_east) - (south_west + 2 * south + south_east)
-    unknown = np.isnan(heights_m[1:-1, 1:-1])
-    to_east[unknown] = to_north[unknown] = np.nan  # its eight neighbours would give an empty cell a slope
-    return to_east / (8 * cell_m), to_north / (8 * (cell_north_m or cell_m))
-
-
-def _neighbour(heights_m: Float64, down: int, right: int) -> Float64:
-    rows, columns = heights_m.shape
-    centre = heights_m[1:-1, 1:-1]
-    near = heights_m[1 + down : rows - 1 + down, 1 + right : columns - 1 + right]
-    missing = np.isnan(near)
-    if not missing.any():
-        return near
-    opposite = heights_m[1 - down : rows - 1 - down, 1 - right : columns - 1 - right]
-    continued = np.where(np.isnan(opposite), centre, 2 * centre - opposite)
-    return np.where(missing, continued, near)
-
-
 def shade(
-    heights_m: Float64, cell_m: float, options: Light, cell_north_m: float | None = None
+    heights_m: npt.NDArray[np.floating[Any]], cell_m: float, options: Light, cell_north_m: float | None = None
 ) -> npt.NDArray[np.uint8]:
     """Return the shade of the inner cells of (rows + 2, columns + 2) heights: 1 to 255, 0 where unknown.
 
-    The brightness of a matt surface: the cosine between its normal and the direction of the light. Cells whose edges
-    differ have that towards north stated, too.
+    Parameters
+    ----------
+    heights_m : north up, NaN where unknown. A missing neighbour is the continuation of the opposite one through the
+        centre, or level with the centre where that is missing too.
+    cell_m : edge of a cell (m); that towards east, where that towards north is stated.
     """
-    east, north = horn_slopes(heights_m, cell_m, cell_north_m)
-    east *= options.z_factor
-    north *= options.z_factor
     azimuth, altitude = math.radians(options.azimuth_deg), math.radians(options.altitude_deg)
-    horizontal = math.cos(altitude)
-    towards_light = math.sin(altitude) - horizontal * (math.sin(azimuth) * east + math.cos(azimuth) * north)
-    brightness = np.maximum(towards_light / np.sqrt(1.0 + east * east + north * north), 0.0)
-    grey = np.rint(1.0 + 254.0 * brightness)
-    return np.where(np.isnan(grey), _EMPTY, grey).astype(np.uint8)
+    horizontal, exaggeration = math.cos(altitude), options.z_factor / 8.0
+    heights = np.array(heights_m, np.float64, order="C")  # one kind of array, for which the kernel is compiled
+    picture = np.empty((heights.shape[0] - 2, heights.shape[1] - 2), np.uint8)
+    shade_raster(
+        heights, exaggeration / cell_m, exaggeration / (cell_north_m or cell_m),
+        horizontal * math.sin(azimuth), horizontal * math.cos(azimuth), math.sin(altitude), picture,
+    )  # fmt: skip
+    return picture
 
 
 def with_empty_rim(heights_m: Float64) -> Float64:
     """Return (rows + 2, columns + 2) heights with unknown ones around them."""
     return np.pad(heights_m, 1, constant_values=np.nan)
-
-
-def shade_in_strips(
-    around_m: Float64, cell_m: float, options: Light, cell_north_m: float | None = None
-) -> npt.NDArray[np.uint8]:
-    """Compute :func:`shade` a few rows at a time to save memory."""
-    rows = around_m.shape[0] - 2
-    strips = [
-        shade(around_m[top : top + _STRIP_ROWS + 2], cell_m, options, cell_north_m)
-        for top in range(0, rows, _STRIP_ROWS)
-    ]
-    return np.concatenate(strips)
 
 
 def with_neighbours(sheet: Sheet, everything: frozenset[TileId]) -> tuple[TileId, ...]:
@@ -268,15 +222,15 @@ def _write_picture(
     step = -(-max(box.width, box.height) // options.picture_px)
     heights_m = _mean_heights(tiles, load_cells, box, step).trimmed()
     cell_m = step * context.grid.cell_m
-    write_picture(path, shade_in_strips(with_empty_rim(heights_m), cell_m, options))
+    write_picture(path, shade(with_empty_rim(heights_m), cell_m, options))
 
 
 def _mean_heights(tiles: Sequence[TileId], load_cells: LoadCells, box: CellBox, step: int) -> MeanPixels:
     """Return means of the heights in pixels of `step` squared cells, north up."""
     pixels = MeanPixels.over(box.height, box.width, (step, step))
     for tile in tiles:
-        cells = cells_of(tile, load_cells)
+        cells = values_in(tile, _HEIGHT, load_cells)
         edge = cells.cells_per_edge
         column = tile.column * edge - box.west + cells.column.astype(np.int64)
-        pixels.add(box.north - 1 - tile.row * edge - cells.row.astype(np.int64), column, cells.height_robust_m)
+        pixels.add(box.north - 1 - tile.row * edge - cells.row.astype(np.int64), column, cells.values)
     return pixels

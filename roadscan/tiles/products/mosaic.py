@@ -14,18 +14,18 @@ from roadscan.core.strict import Strict
 from roadscan.store.codecs.tiff import raster_settings
 from roadscan.tiles.product import Cells, LoadCells, Output, ProductContext, SurveyProduct, TileSummary
 from roadscan.tiles.products.raster import (
+    COLUMNS,
     QUANTITIES,
     CellBox,
     Quantity,
     SparseRaster,
     band_of,
     cell_image,
+    in_unit,
     paste_tile,
-    values_of,
 )
 from roadscan.tiles.products.sheets import (
     Sheet,
-    cells_of,
     check_sheet,
     cut_sheets,
     dated,
@@ -33,6 +33,7 @@ from roadscan.tiles.products.sheets import (
     index_output,
     sheet_of,
     unknown_output,
+    values_in,
     write_index,
 )
 
@@ -103,5 +104,5 @@ def _write_sheet(quantity: Quantity, sheet: Sheet, load_cells: LoadCells, contex
     )
     with raster_settings(), raster.cog(path) as canvas:
         for tile in sheet.tiles:
-            cells = cells_of(tile, load_cells)
-            paste_tile(canvas, raster.box, tile, cell_image(cells, values_of(quantity, cells, context), "float32"))
+            cells = values_in(tile, COLUMNS[quantity], load_cells)
+            paste_tile(canvas, raster.box, tile, cell_image(cells, in_unit(quantity, cells.values, context), "float32"))

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from roadscan.core.crs import MapFrame
 from roadscan.core.grid import QUANTA_PER_M, TileGrid, TileId
 from roadscan.store.codecs.cog import BLOCK, About, Band, write_sparse_cog
-from roadscan.tiles.cells import TileCells
+from roadscan.tiles.cells import CellValues, TileCells
 from roadscan.tiles.product import ProductContext
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def height_unit(frame: MapFrame) -> str:
     return frame.vertical_unit
 
 
-def cell_image(cells: TileCells, values: npt.NDArray[Any], dtype: str) -> npt.NDArray[Any]:
+def cell_image(cells: TileCells | CellValues, values: npt.NDArray[Any], dtype: str) -> npt.NDArray[Any]:
     """Return a (rows, columns) image of one value (n,) a cell, north up, NaN where no point lies."""
     edge = cells.cells_per_edge
     image = np.full((edge, edge), np.nan, dtype=dtype)
@@ -225,15 +225,15 @@ def band_of(quantity: Quantity, context: ProductContext) -> Band:
     }[quantity]
 
 
-def values_of(quantity: Quantity, cells: TileCells, context: ProductContext) -> npt.NDArray[Any]:
-    """Return (n,) values of a quantity, one a cell, in the unit of its band."""
-    unit_m = context.map.vertical_unit_m
-    match quantity:
-        case "height":
-            return cells.height_robust_m / unit_m
-        case "intensity":
-            return cells.intensity_mean
-        case "count":
-            return cells.count
-        case "height_std":
-            return cells.height_std_m.astype("float64") / unit_m
+COLUMNS: Final[dict[Quantity, str]] = {
+    "height": "height_robust_m",
+    "intensity": "intensity_mean",
+    "count": "count",
+    "height_std": "height_std_m",
+}
+"""The column of cells that each quantity draws."""
+
+
+def in_unit(quantity: Quantity, values: npt.NDArray[Any], context: ProductContext) -> npt.NDArray[Any]:
+    """Return (n,) values of a quantity's column in the unit of its band."""
+    return values.astype(np.float64) / context.map.vertical_unit_m if quantity in ("height", "height_std") else values

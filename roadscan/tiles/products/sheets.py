@@ -16,7 +16,7 @@ from roadscan.core.gpstime import utc_from_gps_ns
 from roadscan.core.grid import TileGrid, TileId
 from roadscan.store.codecs.cog import Band, overview_factors
 from roadscan.store.codecs.tiff import check_cog
-from roadscan.tiles.cells import TileCells
+from roadscan.tiles.cells import CellValues
 from roadscan.tiles.product import LoadCells, Output, ProductContext, TileSummary
 from roadscan.tiles.products.raster import CellBox
 
@@ -110,12 +110,12 @@ def dated(context: ProductContext, tiles: Iterable[TileSummary], drawn: Iterable
     return context if first_gps_ns is None else replace(context, date=utc_from_gps_ns(first_gps_ns).date())
 
 
-def cells_of(tile: TileId, load_cells: LoadCells) -> TileCells:
-    """Return the cells of a tile of the survey; raises :class:`StoreError` where they are missing."""
-    cells = load_cells(tile)
-    if cells is None:
+def values_in(tile: TileId, name: str, load_cells: LoadCells) -> CellValues:
+    """Return a column of the cells of a tile; raises :class:`StoreError` where they are missing."""
+    found = load_cells.values(tile, name)
+    if found is None:
         raise StoreError(f"tile {tile} is listed and has no cells", change="run the survey again")
-    return cells
+    return found
 
 
 def write_index(

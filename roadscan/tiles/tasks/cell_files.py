@@ -26,7 +26,7 @@ from roadscan.store.manifest import OutputRecord, recorded_table
 from roadscan.store.readings.group_reader import opened
 from roadscan.store.schema import table_schema
 from roadscan.store.store import MADE_AGAIN, Store
-from roadscan.tiles.cells import TileCells
+from roadscan.tiles.cells import CellValues, TileCells
 from roadscan.tiles.pyramid import Level
 
 if TYPE_CHECKING:
@@ -99,6 +99,16 @@ def read_cells(store: Store, record: OutputRecord, cells_per_edge: int) -> TileC
         offsets, ids = np.zeros(n + 1, np.int32), np.empty(0, np.uint16)
     return TileCells(
         tile=TileId.parse(record.unit), cells_per_edge=cells_per_edge, pass_offsets=offsets, pass_ids=ids, **known
+    )
+
+
+def read_values(store: Store, record: OutputRecord, cells_per_edge: int, name: str) -> CellValues:
+    """Return one column of the cells of a finished tile; NaN where a ``surface`` lacks it."""
+    rows = recorded_table(store, record, ("column", "row", name))
+    column, row = (rows.column(one).to_numpy() for one in ("column", "row"))
+    known = name in rows.column_names
+    return CellValues(
+        cells_per_edge, column, row, rows.column(name).to_numpy() if known else np.full(column.size, np.nan, np.float32)
     )
 
 

@@ -15,6 +15,7 @@ from roadscan.core.grid import TileGrid, TileId
 from roadscan.tiles.product import Output
 from roadscan.tiles.products.mosaic import Mosaic, MosaicOptions
 from roadscan.tiles.products.sheets import cut_sheets
+from tests.workshop import CellsInMemory
 
 QUANTITIES = {
     "height": "height_robust_m",
@@ -197,7 +198,7 @@ def test_a_listed_tile_without_cells_is_an_error(mosaic, one_survey, tmp_path):
     options = MosaicOptions(quantities=("height",))
     output = mosaic.outputs(list(survey.tiles), options, survey.context)[0]
     with pytest.raises(StoreError, match="is listed and has no cells"):
-        mosaic.write(output, survey.summaries, lambda tile: None, options, survey.context, tmp_path / "x")
+        mosaic.write(output, survey.summaries, CellsInMemory({}, {}), options, survey.context, tmp_path / "x")
     assert not list(tmp_path.iterdir())  # the scratch file is gone
 
 

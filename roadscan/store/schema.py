@@ -227,7 +227,6 @@ def _schema_files() -> dict[str, Path]:
     return found
 
 
-@functools.cache
 def table_locations() -> dict[str, str]:
     """Return the folder in the store of each table that a run makes.
 

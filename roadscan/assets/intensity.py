@@ -26,8 +26,8 @@ from roadscan.assets.kernels.beams import log_gains, meet_ground
 from roadscan.assets.quantiles import weighted_quantile
 from roadscan.assets.scene import GroundModel, Returns, Scene
 from roadscan.compute.array_types import Bool, Float64, Int64
+from roadscan.compute.arrays import scatter_about
 from roadscan.compute.kernel_options import read_only
-from roadscan.compute.robust import scatter_about
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array

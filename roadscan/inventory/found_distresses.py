@@ -27,10 +27,10 @@ from roadscan.inventory.state import reference_points
 from roadscan.run.session import Session
 from roadscan.store.asset_schema import AssetColumn, AssetSchema, asset_kind_names, asset_schema
 from roadscan.store.manifest import OutputRecord, read_recorded
+from roadscan.tiles.cells import Level, overview_factors
 from roadscan.tiles.mosaics.products import StoredTiles
 from roadscan.tiles.product import ProductContext, TileSummary
 from roadscan.tiles.products.geo_table import in_crs_unit, read_geo_table
-from roadscan.tiles.pyramid import Level, overview_factors
 from roadscan.tiles.tasks.tile_figures import summary_of
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE
 from roadscan.tiles.tasks.wanted_products import product_context

@@ -26,7 +26,7 @@ from roadscan.assets.edges.steps import HeightRaster, gaussian, raster_of
 from roadscan.assets.kernels import step_profiles
 from roadscan.assets.scene import Scene, once_a_scene, once_a_tile
 from roadscan.compute.array_types import Bool, Float64
-from roadscan.compute.edges.across import edge_along
+from roadscan.compute.edges import edge_along
 
 FIRST_M: Final = 0.3
 """The transect begins this far (m) behind the middle of the edge's face."""

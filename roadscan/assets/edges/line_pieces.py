@@ -19,8 +19,7 @@ from roadscan.assets.edges.profiles import Nodes
 from roadscan.assets.edges.steps import HeightRaster
 from roadscan.assets.scene import Box, Scene
 from roadscan.compute.array_types import Bool, Float64, Int64
-from roadscan.compute.robust import scatter_about
-from roadscan.compute.ways import way_along
+from roadscan.compute.arrays import scatter_about, way_along
 
 NODE_COLUMNS: Final = (
     "easting_m", "northing_m", "height_m", "step_m", "sigma_step_m", "face_m", "scatter_m", "sigma_m", "seen_low",

@@ -16,7 +16,7 @@ from roadscan.assets.edges.steps import HeightRaster, Places
 from roadscan.assets.kernels import step_profiles as kernel
 from roadscan.assets.kernels.edge_links import MAX_LINKS, best_ways, find_links, trace
 from roadscan.compute.array_types import Bool, Float64, Int64
-from roadscan.compute.ways import way_along
+from roadscan.compute.arrays import way_along
 
 FREE_M: Final = 0.3
 """Distance of consecutive places (m) that is no gap."""

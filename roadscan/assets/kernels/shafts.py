@@ -9,7 +9,7 @@ import numpy as np
 
 from roadscan.assets import classes
 from roadscan.compute.kernel_options import inlined, inner, kernel
-from roadscan.compute.kernels.sorted_quantile import sorted_quantile
+from roadscan.compute.kernels.arrays import sorted_quantile
 
 REACHES_M = (0.3, 0.2, 0.15)
 """Components this near to the axis (m) belong to it, round after round."""

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from roadscan.compute.kernel_options import inlined, inner, kernel
-from roadscan.compute.kernels.sorted_quantile import sorted_quantile
+from roadscan.compute.kernels.arrays import sorted_quantile
 
 LANES = 8  # Returns of a cell whose neighbours are sought together.
 

@@ -21,8 +21,7 @@ from roadscan.assets.edges.steps import HeightRaster, raster_of
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
 from roadscan.assets.scene import Scene
 from roadscan.compute.array_types import Bool, Float64
-from roadscan.compute.robust import scatter_about
-from roadscan.compute.ways import way_along
+from roadscan.compute.arrays import scatter_about, way_along
 from roadscan.core.extras import cv2
 from roadscan.core.strict import Strict
 

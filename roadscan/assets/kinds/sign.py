@@ -28,7 +28,7 @@ from roadscan.assets.upright.regions import on_thin, regions_of
 from roadscan.assets.upright.shafts import shafts_of
 from roadscan.assets.upright.slices import places_of, touching, usable
 from roadscan.compute.array_types import Bool, Float64, Int64
-from roadscan.compute.robust import SIGMA_OF_MAD
+from roadscan.compute.arrays import SIGMA_OF_MAD
 
 _VOXEL_M: Final = 0.2  # Edge of a voxel (m).
 _THICK_M: Final = 0.06  # Greatest distance of a plate's returns from its plane (m).

@@ -12,7 +12,7 @@ from roadscan.assets.paint.components import CELL_M, SEED_CONTRAST, Component, C
 from roadscan.assets.quantiles import median
 from roadscan.assets.scene import Scene
 from roadscan.compute.array_types import Float64, Int64
-from roadscan.compute.ways import way_along
+from roadscan.compute.arrays import way_along
 
 _DRIVE_STEP_M: Final = 1.0  # Distance of points along a drive (m).
 _OVER_M: Final = 3.0

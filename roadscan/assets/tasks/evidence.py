@@ -26,16 +26,14 @@ from roadscan.assets.visibility import CELL_M, passes_in_sight, screens_of
 from roadscan.core.errors import SchemaError
 from roadscan.core.grid import TileId
 from roadscan.core.strict import Strict
-from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import reason_of
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.store.writer import parquet_bytes
-from roadscan.tiles.blocks import Block
-from roadscan.tiles.product import ProductContext
-from roadscan.tiles.tasks.tile_files import publish_file
+from roadscan.tiles.product import ProductContext, publish_file
+from roadscan.tiles.tasks.tile_plan import Block
 from roadscan.tiles.tasks.tiles import TaskResult
 
 EVIDENCE: Final = "asset_evidence"

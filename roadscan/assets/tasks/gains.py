@@ -21,16 +21,15 @@ from roadscan.assets.tasks.load_returns import LoadedSquare, ReturnsTask, load_s
 from roadscan.assets.tasks.plan import AssetPlan, cut_squares, grid_of, readings_of, square_key
 from roadscan.assets.tiling import AssetGrid, Halos
 from roadscan.core.grid import TileId
-from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import reason_of
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.store.writer import parquet_bytes
-from roadscan.tiles.blocks import Block
-from roadscan.tiles.tasks.tile_files import publish_file
+from roadscan.tiles.product import publish_file
+from roadscan.tiles.tasks.tile_plan import Block
 from roadscan.tiles.tasks.tiles import TaskResult
 
 

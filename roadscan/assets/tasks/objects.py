@@ -18,7 +18,7 @@ from roadscan.assets.tiling import AssetGrid
 from roadscan.core.grid import TileId
 from roadscan.core.strict import Strict
 from roadscan.run.engine.compute import damaged_file, reason_of
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import key_of
 from roadscan.store.asset_schema import asset_schema
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table

@@ -24,13 +24,11 @@ from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
 from roadscan.georeference.sources import ReadingSource, geometry_of
 from roadscan.navigation.tasks.trajectories import TrajectorySource
 from roadscan.pictures.placed import rule_cameras
-from roadscan.run.code_reach import code_digest, name_of
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of, name_of
 from roadscan.store.asset_schema import AssetSchema, asset_schema
 from roadscan.store.digest import bytes_digest
-from roadscan.tiles.blocks import Block, cut_blocks
 from roadscan.tiles.product import ProductContext
-from roadscan.tiles.tasks.tile_plan import PlannedTiles, TilePlan, plan_tiles
+from roadscan.tiles.tasks.tile_plan import Block, PlannedTiles, TilePlan, cut_blocks, plan_tiles
 from roadscan.tiles.tasks.wanted_products import product_context
 
 

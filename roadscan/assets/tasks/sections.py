@@ -22,12 +22,10 @@ from roadscan.compute.array_types import Bool, Float64
 from roadscan.condition.road_line import RoadLine
 from roadscan.condition.tasks.lines import Roads
 from roadscan.core.grid import TileId
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.store import Store
-from roadscan.tiles.product import ProductContext
-from roadscan.tiles.tasks.tile_files import publish_file
+from roadscan.tiles.product import ProductContext, publish_file
 
 if TYPE_CHECKING:
     import pandas as pd

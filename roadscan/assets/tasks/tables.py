@@ -25,16 +25,14 @@ from roadscan.core.rig import UNMOUNTED, Mountings
 from roadscan.georeference.plan.plan import trajectory_source
 from roadscan.georeference.sensor_places import sensor_places
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_trajectory, pose_sigma
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.store.asset_schema import ASSET_FOLDER, AssetSchema
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded, recorded_table
 from roadscan.store.small_tables import small_path
 from roadscan.store.store import Store
-from roadscan.tiles.product import ProductContext
+from roadscan.tiles.product import ProductContext, publish_file
 from roadscan.tiles.products.geo_table import read_geo_table, write_geo_table
-from roadscan.tiles.tasks.tile_files import publish_file
 
 _BESIDE_M: Final = 50.0
 """Assets farther from all lines (m) have no road."""

@@ -16,7 +16,7 @@ from roadscan.assets.upright.panels import Panel
 from roadscan.assets.upright.pieces import seen_by
 from roadscan.assets.upright.slices import places_of
 from roadscan.compute.array_types import Bool, Float64, Int64
-from roadscan.compute.robust import SIGMA_OF_MAD
+from roadscan.compute.arrays import SIGMA_OF_MAD
 
 COUNTS: Final = ("returns", "stopped", "passed", "under", "foot", "cells", "open_cells", "leaves")
 STRETCHES: Final = ("ground_m", "low_m", "high_m", "bulk_m", "length_m", *COUNTS, "open_top")

@@ -17,22 +17,20 @@ from roadscan.tiles.products.raster import (
     QUANTITIES,
     CellBox,
     Quantity,
+    Sheet,
     SparseRaster,
     band_of,
     cell_image,
-    paste_tile,
-    values_of,
-)
-from roadscan.tiles.products.sheets import (
-    Sheet,
     cells_of,
     check_sheet,
     cut_sheets,
     dated,
     index_name,
     index_output,
+    paste_tile,
     sheet_of,
     unknown_output,
+    values_of,
     write_index,
 )
 

@@ -11,7 +11,7 @@ import shapely
 from roadscan.assets.kind import AssetObject
 from roadscan.assets.pictures.reader import ColourPlaces, ColourReader
 from roadscan.compute.array_types import Float64, UInt8
-from roadscan.compute.robust import scatter_about
+from roadscan.compute.arrays import scatter_about
 
 _LEAST_PLACES: Final = 5  # Least number of places of paint, and of surface.
 _BRIGHTER: Final = 1.15

@@ -13,7 +13,7 @@ from roadscan.assets.kind import AssetObject, reference_point
 from roadscan.assets.pictures.reader import CutOut, CutOutReader, Recognition, Sight
 from roadscan.assets.probabilities import Curve
 from roadscan.compute.array_types import Bool, Float64, UInt8
-from roadscan.compute.ways import way_along
+from roadscan.compute.arrays import way_along
 from roadscan.core.extras import cv2
 
 HUES: Final = {"red": (340.0, 14.0), "orange": (14.0, 40.0), "yellow": (40.0, 70.0), "green": (70.0, 178.0),

@@ -1,10 +1,51 @@
-"""Finds the k-th smallest of many whole numbers, by bins."""
+"""Small loops over arrays: copies, quantiles of sorted values, k-th smallest numbers, and bounds of profiles."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from roadscan.compute.kernel_options import bare, bare_inner
+from roadscan.compute.kernel_options import bare, bare_inner, inlined, kernel
+
+
+@bare
+def copy_values(values, out):
+    """Copy values (n,) to the first n elements of `out` (n,), converted to its type."""
+    for k in range(out.size):
+        out[k] = values[k]
+
+
+@inlined
+def sorted_quantile(held, share):
+    """Returns the number below which a share of sorted values (n,) lies, interpolated as NumPy does."""
+    place = (held.size - 1) * share
+    i = int(place)
+    low, high, past = held[i], held[min(i + 1, held.size - 1)], place - i
+    return high - (high - low) * (1.0 - past) if past >= 0.5 else low + (high - low) * past
+
+
+_ONE = np.uint16(1)  # Subtracted from raw ranges in their type, so that 0 (no return) wraps to the largest number.
+
+
+@kernel
+def range_bounds(ranges, low, high):
+    """Write the lowest and the highest range of each profile's returns (not 0); 0 for profiles without any.
+
+    Parameters
+    ----------
+    ranges
+        (n, m) uint16, raw.
+    low, high
+        (n,) uint16, out.
+    """
+    for k in range(ranges.shape[0]):
+        least, most = np.uint16(65535), np.uint16(0)
+        for i in range(ranges.shape[1]):
+            value = ranges[k, i]
+            below = np.uint16(value - _ONE)  # 0 (no return) wraps to the largest number
+            least = below if below < least else least
+            most = value if value > most else most
+        low[k], high[k] = np.uint16(least + _ONE), most
+
 
 BINS = 256  # Bins of one pass over the numbers.
 _BITS = 8  # Binary logarithm of BINS.

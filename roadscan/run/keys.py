@@ -1,4 +1,6 @@
-"""Digests of the code on which an output depends, so that a key changes with that code and no other.
+"""Keys: short hashes of everything on which an output depends, and digests of the code that makes it.
+
+Digests of the code on which an output depends, so that a key changes with that code and no other.
 
 The unit is a definition: a function, a class, or a name that a module assigns. Starting from the function or class
 that makes an output, every definition whose name occurs in one that is reached is reached as well, annotations
@@ -29,11 +31,15 @@ import json
 import re
 import secrets
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeAlias
 
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.crs import Geoid
 from roadscan.core.kept import kept
 from roadscan.core.private_folder import UnsafeFolderError, cache_place, check_private, make_private
 
@@ -47,9 +53,8 @@ CARRIERS: Final = (
     "roadscan.compute.kernel_options",
     "roadscan.core.kept",
     "roadscan.core.plugins",
-    "roadscan.run.code_reach",
+    "roadscan.run.keys",
     "roadscan.run.engine.compute",
-    "roadscan.run.engine.fingerprint",
     "roadscan.core.errors",
     "roadscan.core.extras",
     "roadscan.core.strict",
@@ -405,3 +410,35 @@ def _count_in(packages: Iterable[str]) -> None:
         _OWN.update(new)
         for known in (_file_of, _module, _digest_of):
             known.cache_clear()
+
+
+def key_of(*parts: Any) -> str:
+    """Return sixteen hexadecimal digits for JSON-like values (order matters, dictionaries are sorted)."""
+    text = json.dumps(parts, sort_keys=True, default=str, separators=(",", ":"))
+    return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
+
+
+def keys_of(common: str, content: npt.NDArray[np.void], ends: npt.NDArray[np.int64]) -> list[str]:
+    """Return a key for each part of an array of records, (parts,) `ends` of the parts; `common` enters all keys.
+
+    Faster than :func:`key_of` for the tiles of a network.
+    """
+    begun = hashlib.blake2b(common.encode(), digest_size=8)
+    stream, size, start, found = memoryview(content.tobytes()), content.dtype.itemsize, 0, []
+    for end in (size * ends).tolist():
+        one = begun.copy()
+        one.update(stream[start:end])
+        found.append(one.hexdigest())
+        start = end
+    return found
+
+
+def keys_beside(keys: Sequence[str], other: str) -> list[str]:
+    """Return ``key_of(key, other)`` for each of many keys, which are hexadecimal digits."""
+    end = f'",{json.dumps(other)}]'
+    return [hashlib.blake2b(f'["{key}{end}'.encode(), digest_size=8).hexdigest() for key in keys]
+
+
+def grid_key(geoid: Geoid | None) -> list[str] | None:
+    """Return name and content of a geoid grid: a replaced grid counts as another one."""
+    return None if geoid is None else [geoid.grid, geoid.content]

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from benchmarks.timing import Figure
 from roadscan.core.grid import Bounds, TileGrid
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import ScanGeometry
 from roadscan.core.settings.segmentation import SegmentationConfig
 from roadscan.georeference.road_profiles import segmented
 from roadscan.surface.regions import CoarseModel, CoarseSettings, RegionSettings, Stretch, coarse_model, find_regions

@@ -13,7 +13,7 @@ from roadscan.core.crs import MapFrame
 from roadscan.core.grid import QUANTA_PER_M, TileGrid, TileId
 from roadscan.georeference.cloud import TilePoints
 from roadscan.site.cloud_file import PointSpool, write_cloud
-from roadscan.tiles.products.cloud_records import Lattice
+from roadscan.tiles.products.las import Lattice
 
 TILES, POINTS = 12, 500_000
 GRID = TileGrid(10.0, 0.005)

@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.timing import Figure, best_seconds
 from roadscan.core.crs import MapFrame, world_from_geodetic
-from roadscan.core.rig import Mountings, Sensor
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import Mountings, ScanGeometry, Sensor
 from roadscan.georeference.charts import charts_along
 from roadscan.georeference.place import HeightLimits, Placement
 from roadscan.georeference.reach import RangeSpans, Reach

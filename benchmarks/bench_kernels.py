@@ -15,15 +15,14 @@ from scipy.spatial.transform import Rotation, Slerp
 from benchmarks.timing import Figure, best_seconds
 from roadscan.core.crs import MapFrame, world_from_geodetic
 from roadscan.core.grid import TileGrid, TileId
-from roadscan.core.rig import Mountings, Sensor
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import Mountings, ScanGeometry, Sensor
 from roadscan.georeference.charts import charts_along
 from roadscan.georeference.cloud import TilePoints
 from roadscan.georeference.kernels.readings import FATES, Placed, Returns
 from roadscan.georeference.kernels.timed_readings import CHUNK, place_returns
 from roadscan.georeference.place import EVERYWHERE, HeightLimits, Placement
 from roadscan.poses.trajectory import Trajectory
-from roadscan.tiles.statistics import cells_of
+from roadscan.tiles.accumulator import cells_of
 
 N = 4_000_000
 HDL_32E_PER_S = 700_000

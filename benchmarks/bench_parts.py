@@ -26,7 +26,7 @@ from benchmarks.settings import Settings, bench_folder
 from benchmarks.timing import Figure
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Inline
-from roadscan.run.engine.embedded import MEMORY_KEPT
+from roadscan.run.engine.compute_on import MEMORY_KEPT
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
 from roadscan.store.store import Store
@@ -51,7 +51,7 @@ _PARTS = {
     "cells finished": ("roadscan.tiles.accumulator:Accumulator.finish",),
     "cells.parquet": ("roadscan.tiles.tasks.tiles:write_cells",),
     "overviews": ("roadscan.tiles.tasks.tiles:write_overviews", "roadscan.tiles.product:pyramid_of"),
-    "digests, renames": ("roadscan.tiles.tasks.tiles:publish_file", "roadscan.tiles.tasks.tile_files:publish_product"),
+    "digests, renames": ("roadscan.tiles.tasks.tiles:publish_file", "roadscan.tiles.product:publish_product"),
 }
 """Functions, and methods of classes, by the part that they are."""
 _BYTES = {

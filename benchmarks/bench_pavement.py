@@ -20,14 +20,13 @@ from roadscan.core.crs import MapFrame
 from roadscan.core.grid import TileGrid, TileId
 from roadscan.store.codecs.cog import Band
 from roadscan.store.codecs.tiff import raster_settings
-from roadscan.tiles.cells import TileCells
+from roadscan.tiles.cells import Level, TileCells
 from roadscan.tiles.product import ProductContext, Tile, TileSummary
 from roadscan.tiles.products.hillshade import HillshadeOptions, shade
 from roadscan.tiles.products.kilometre import Kilometre, KilometreOptions
 from roadscan.tiles.products.model_las import ModelLas, ModelLasFine, decimate
 from roadscan.tiles.products.pavement import IntensityOptions, PavementIntensity, PavementShaded, ShadedOptions
 from roadscan.tiles.products.raster import CellBox, SparseRaster, paste_tile
-from roadscan.tiles.pyramid import Level
 
 EDGE, WIDTH, CELL_M = 2000, 800, 0.005
 CONTEXT = ProductContext("bench", "", MapFrame("EPSG:25832"), TileGrid(10.0, CELL_M), (), dt.date(2026, 4, 24))

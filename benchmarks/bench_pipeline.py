@@ -14,8 +14,7 @@ from roadscan.core.grid import TileId
 from roadscan.core.survey import Survey
 from roadscan.demo.demo import summarise
 from roadscan.run.engine.compute import Inline
-from roadscan.run.selection import Selection
-from roadscan.run.session import Session
+from roadscan.run.session import Selection, Session
 from roadscan.run.stage import stages
 from roadscan.simulate import Scene, simulate
 from roadscan.store.logs import read_log_records

@@ -21,12 +21,10 @@ from benchmarks.timing import Figure, thread_seconds
 from roadscan.core.crs import MapFrame
 from roadscan.core.grid import TileGrid, TileId
 from roadscan.store.codecs.tiff import raster_crs, raster_settings
-from roadscan.tiles.cells import TileCells
+from roadscan.tiles.cells import TileCells, overview_factors, pyramid_of, write_cells, write_overviews
 from roadscan.tiles.product import ProductContext, Tile
 from roadscan.tiles.products.geotiff import GeoTiff, GeoTiffOptions
 from roadscan.tiles.products.raster import CellBox, cell_image
-from roadscan.tiles.pyramid import overview_factors, pyramid_of
-from roadscan.tiles.tasks.cell_files import write_cells, write_overviews
 
 READINGS_A_CELL = 25
 EDGE = 2000

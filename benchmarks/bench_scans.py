@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from fsspec.implementations.local import LocalFileSystem
 
 from benchmarks.timing import Figure, best_seconds
-from roadscan.store.readings.profiles import ProfileReader
+from roadscan.store.readings.row_groups import ProfileReader
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.store.writer import write_parquet

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.observations import FIXED, KINDS, Observations, partials
-from roadscan.adjust.process import GaussMarkov, RunPrior
+from roadscan.adjust.observations import FIXED, KINDS, GaussMarkov, Observations, RunPrior, partials
 
 Float64 = npt.NDArray[np.float64]
 Int64 = npt.NDArray[np.int64]

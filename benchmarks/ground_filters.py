@@ -21,8 +21,7 @@ import numpy.typing as npt
 from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import Delaunay
 
-from roadscan.assets.ground.filling import filled
-from roadscan.assets.ground.morphological import opened
+from roadscan.assets.ground.surface import filled, opened
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]

@@ -18,7 +18,7 @@ from typing import Any
 import psutil
 
 from benchmarks.surveys import BenchSurvey
-from roadscan.compute.kernels.processor import compiles_for
+from roadscan.compute.kernels.vectors import compiles_for
 from tests.kernels.test_plain_processor import AVX2
 
 _EVERY_S = 0.05

@@ -24,8 +24,7 @@ from roadscan.georeference.place import HeightLimits
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.sources import MapSettings, ReadingSource
 from roadscan.navigation.tasks.trajectories import TrajectorySource
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.store.logs import DataFile
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store

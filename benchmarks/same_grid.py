@@ -21,8 +21,8 @@ from benchmarks.skilled_user import Cells, Points, to_cells
 from benchmarks.timing import Figure, best_seconds
 from roadscan.core.grid import TileGrid, TileId
 from roadscan.georeference.cloud import TilePoints
+from roadscan.tiles.accumulator import cells_of
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.statistics import cells_of
 
 CELL_M = 0.02
 _TILE_M = 10.0

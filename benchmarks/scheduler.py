@@ -20,7 +20,7 @@ import psutil
 from distributed import Client, Security
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from roadscan.run.engine.embedded import QUIET_CLUSTER, closed_cluster
+from roadscan.run.engine.compute_on import QUIET_CLUSTER, closed_cluster
 from roadscan.run.engine.on_dask import QUIET_CLIENT
 
 

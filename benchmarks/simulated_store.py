@@ -31,8 +31,8 @@ from roadscan.georeference.tick_clocks import PRODUCT as TICKS
 from roadscan.georeference.tick_clocks import TickTask
 from roadscan.run.engine.bundles import Bundle, Ended
 from roadscan.run.engine.compute import Done, Inline
-from roadscan.run.engine.fingerprint import key_of
 from roadscan.run.engine.measured import Measured
+from roadscan.run.keys import key_of
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.store.digest import bytes_digest
@@ -45,10 +45,9 @@ from roadscan.store.writer import parquet_bytes
 from roadscan.strips.work import PRODUCT as STRIPS
 from roadscan.strips.work import StripTask
 from roadscan.survey.run import run_stages
+from roadscan.tiles.accumulator import cells_of
+from roadscan.tiles.cells import overview_factors, pyramid_of, write_cells, write_overviews
 from roadscan.tiles.product import Tile
-from roadscan.tiles.pyramid import overview_factors, pyramid_of
-from roadscan.tiles.statistics import cells_of
-from roadscan.tiles.tasks.cell_files import write_cells, write_overviews
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, TileTask
 from roadscan.tiles.tasks.tiles import TaskResult
 

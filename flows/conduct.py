@@ -22,8 +22,7 @@ from roadscan.core.survey import Survey
 from roadscan.flows.expected import failed, failed_stage, log_without_tracebacks
 from roadscan.run.engine.compute_on import compute_on
 from roadscan.run.progress import LineReporter
-from roadscan.run.selection import Selection
-from roadscan.run.session import Session
+from roadscan.run.session import Selection, Session
 from roadscan.run.stage import Stage, stages
 from roadscan.run.told import Asked, told_run
 from roadscan.store.store import Store

@@ -13,7 +13,7 @@ from roadscan.core.gpstime import gps_ns_from_utc
 from roadscan.core.grid import Bounds, TileId
 from roadscan.flows.conduct import conduct, run_name
 from roadscan.flows.expected import failed
-from roadscan.run.selection import Selection
+from roadscan.run.session import Selection
 
 
 @flow(name="reprocess", flow_run_name=run_name, persist_result=False)

@@ -10,8 +10,7 @@ import pytest
 
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Compute, Inline
-from roadscan.run.selection import Selection
-from roadscan.run.session import Reporter, Session
+from roadscan.run.session import Reporter, Selection, Session
 from roadscan.run.stage import stages
 from roadscan.simulate import Scene, simulate
 from roadscan.store.store import Store

@@ -31,7 +31,7 @@ from roadscan.simulate.truth import Truth
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
-from roadscan.tiles.tasks.cell_files import read_cells
+from roadscan.tiles.cells import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE
 
 PROFILES = 60

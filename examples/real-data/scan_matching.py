@@ -24,7 +24,7 @@ import pandas as pd
 import small_gicp
 from scipy.spatial.transform import Rotation
 
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import ScanGeometry
 from roadscan.core.survey import Survey
 from roadscan.store.logs import read_log_records
 from roadscan.store.store import Store

@@ -1,12 +1,12 @@
 """The adjustment: from observations to corrections of every run's poses, with their covariance.
 
 Corrections are piecewise linear between knots in time. Each component of each run has a first-order Gauss–Markov
-process as prior, whose σ is that of each pose (:mod:`roadscan.adjust.process`); ties and control are observations; what
-solves them is one sparse least-squares problem (:mod:`roadscan.adjust.sparse_normal`), weighed anew until nothing
+process as prior, whose σ is that of each pose (:mod:`roadscan.adjust.observations`); ties and control are observations;
+what solves them is one sparse least-squares problem (:mod:`roadscan.adjust.sparse_normal`), weighed anew until nothing
 changes (:mod:`roadscan.adjust.estimation`). A control point's survey is a separate observation: all runs that saw the
 point share its error. Surveys are first left aside, and judged by what poses and ties say of them
-(:mod:`roadscan.adjust.control_test`); then those that are right count, wholly. Mountings of sensors, which all
-runs share, are unknowns beside the poses.
+(:mod:`roadscan.adjust.control_test`); then those that are right count, wholly. Mountings of sensors, which all runs
+share, are unknowns beside the poses.
 """
 
 from __future__ import annotations
@@ -21,8 +21,17 @@ import numpy.typing as npt
 from roadscan.adjust.control_test import COMPONENTS as SURVEYED
 from roadscan.adjust.control_test import AppliedOffset, ControlVerdict, SurveyErrors, applied_offset, judged
 from roadscan.adjust.estimation import SURVEY, Estimate, Groups, Problem, Rounds
-from roadscan.adjust.observations import COMPONENTS, FIXED, KINDS, MOUNTED, Observations
-from roadscan.adjust.process import CameraPrior, MountingPrior, RunPrior, line_variance
+from roadscan.adjust.observations import (
+    COMPONENTS,
+    FIXED,
+    KINDS,
+    MOUNTED,
+    CameraPrior,
+    MountingPrior,
+    Observations,
+    RunPrior,
+    line_variance,
+)
 from roadscan.adjust.settings import AdjustmentSettings
 from roadscan.adjust.sparse_normal import Rows
 from roadscan.adjust.unknowns import HEIGHT_ALONE, ControlPoints, FixedRun, Unknowns, directions_of, fixed_runs

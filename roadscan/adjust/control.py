@@ -24,7 +24,7 @@ from roadscan.adjust.targets.shapes import (
     height_at,
 )
 from roadscan.compute.array_types import Float64
-from roadscan.compute.robust import scatter_about
+from roadscan.compute.arrays import scatter_about
 from roadscan.core.counted import listed
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.poses.movement import MountingChange, Seat

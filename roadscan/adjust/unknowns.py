@@ -1,8 +1,8 @@
 """The unknowns of an adjustment, and its observations as rows of them.
 
 Unknowns are in units of their prior σ: the parts of the corrections of each run's components at its knots
-(:mod:`roadscan.adjust.process`), then the errors of the surveyed coordinates of control points (north, east, down),
-which all runs that saw a point share, then those of the mountings of sensors, which all runs share.
+(:mod:`roadscan.adjust.observations`), then the errors of the surveyed coordinates of control points (north, east,
+down), which all runs that saw a point share, then those of the mountings of sensors, which all runs share.
 """
 
 from __future__ import annotations
@@ -15,10 +15,15 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.control_test import quantile
-from roadscan.adjust.observations import CAMERA, COMPONENTS, FIXED, KINDS, MOUNTED, Observations
-from roadscan.adjust.process import (
+from roadscan.adjust.observations import (
+    CAMERA,
+    COMPONENTS,
+    FIXED,
+    KINDS,
+    MOUNTED,
     CameraPrior,
     MountingPrior,
+    Observations,
     RunPrior,
     knots_of,
     line_variance,

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from roadscan.adjust.places import Track
 from roadscan.adjust.ties.tie import PLANE
 from roadscan.compute.array_types import Float64
-from roadscan.compute.robust import scatter_about
+from roadscan.compute.arrays import scatter_about
 from roadscan.core.witness import Finding, Witness
 
 _STEEP_RAD: Final = np.radians(6.0)

@@ -20,7 +20,7 @@ from pydantic import Field
 from roadscan.calibrate.evidence import Known, Seen, Ties
 from roadscan.calibrate.surfels import Surfels
 from roadscan.compute.array_types import Bool, Float64, Int64
-from roadscan.compute.robust import scatter_about
+from roadscan.compute.arrays import scatter_about
 from roadscan.core.errors import ConfigError
 from roadscan.core.extras import small_gicp
 from roadscan.core.rig import Mounting

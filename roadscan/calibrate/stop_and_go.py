@@ -29,7 +29,7 @@ from scipy.sparse import csr_matrix, diags
 from roadscan.calibrate.evidence import AttitudeInfluence, Orientation
 from roadscan.calibrate.rotations import cross_matrix, exponential, logarithm
 from roadscan.compute.array_types import Float64, Int64
-from roadscan.compute.robust import SIGMA_OF_MAD
+from roadscan.compute.arrays import SIGMA_OF_MAD
 from roadscan.core.crs import LOCAL_WORLD
 from roadscan.core.errors import NavigationError
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns

@@ -25,7 +25,7 @@ from roadscan.cli.survey import Where, run_and_sum_up, run_survey, sum_up
 from roadscan.cli.terminal import print_json, print_table
 
 if TYPE_CHECKING:
-    from roadscan.run.selection import Selection
+    from roadscan.run.session import Selection
 
 
 @dataclass(frozen=True)
@@ -193,7 +193,7 @@ def selected(tiles: list[str] | None, bbox: str | None, span: str | None) -> Sel
     """The selection of tiles that the options state."""
     from roadscan.core.errors import ConfigError
     from roadscan.core.grid import Bounds, TileId
-    from roadscan.run.selection import Selection
+    from roadscan.run.session import Selection
 
     box = times = None
     if bbox is not None:

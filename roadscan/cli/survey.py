@@ -10,8 +10,7 @@ from roadscan.cli.summaries import print_summary
 from roadscan.cli.terminal import new_reporter
 
 if TYPE_CHECKING:
-    from roadscan.run.selection import Selection
-    from roadscan.run.session import Session
+    from roadscan.run.session import Selection, Session
     from roadscan.store.store import Store
 
 

@@ -1,6 +1,6 @@
 """Types of arrays by the type of their elements, for annotations.
 
-In the digests of code (:mod:`roadscan.run.code_reach`) they count as if each module that imports them had written them.
+In the digests of code (:mod:`roadscan.run.keys`) they count as if each module that imports them had written them.
 """
 
 from __future__ import annotations

@@ -15,8 +15,8 @@ import numpy as np
 import scipy
 
 from roadscan.compute.array_types import Float64, Int64
+from roadscan.compute.arrays import smoothed_knots, way_along
 from roadscan.compute.kernels.curved_grid import thin_path
-from roadscan.compute.ways import smoothed_knots, way_along
 from roadscan.core.errors import NavigationError
 
 KNOT_M: Final = 0.25

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import shapely
 
 from roadscan.compute.array_types import Float64
-from roadscan.compute.edges.painted_line import painted_line, without_lines
+from roadscan.compute.edges import painted_line, without_lines
 from roadscan.condition.edge_raster import STATION_M
 from roadscan.condition.kernels.lane_texture import (
     FIGURES,

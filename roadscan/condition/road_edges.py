@@ -4,7 +4,7 @@ After P. Kumar, C. P. McElhinney, P. Lewis and T. McCarthy, *An automated algori
 terrestrial mobile LiDAR data* (ISPRS Journal 85, 2013): the slope across the road shows its edge, and intensity and
 pulse width where the slope does not. They fit a snake to rasters of the three; here each change across
 the road is measured in standard deviations, and the best path is found by dynamic programming
-(:mod:`roadscan.compute.edges.across`). Pulse widths are in no table of roadscan. Where neither heights nor intensities
+(:mod:`roadscan.compute.edges`). Pulse widths are in no table of roadscan. Where neither heights nor intensities
 show an edge, the line painted along the border of the lane is used.
 """
 
@@ -21,10 +21,8 @@ import numpy.typing as npt
 import shapely
 
 from roadscan.compute.array_types import Bool, Float64
-from roadscan.compute.edges.across import DEFAULT, AcrossSettings, counted, evidence_across, path_along
-from roadscan.compute.edges.painted_line import PAINT, without_lines
-from roadscan.compute.flags import runs_of
-from roadscan.compute.robust import SIGMA_OF_MAD
+from roadscan.compute.arrays import SIGMA_OF_MAD, runs_of
+from roadscan.compute.edges import DEFAULT, PAINT, AcrossSettings, counted, evidence_across, path_along, without_lines
 from roadscan.condition.edge_raster import OFFSET_M, STATION_M, SideRaster, TilePoints, ground_points, side_raster
 from roadscan.condition.road_line import Lane, RoadLine
 

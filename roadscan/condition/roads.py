@@ -11,8 +11,8 @@ import numpy.typing as npt
 import scipy
 
 from roadscan.compute.array_types import Bool, Float64
+from roadscan.compute.arrays import smoothed_knots, way_along
 from roadscan.compute.kernels.curved_grid import thin_path
-from roadscan.compute.ways import smoothed_knots, way_along
 from roadscan.condition.road_line import NODE_M, Lane, RoadLine
 from roadscan.condition.settings import ConditionConfig
 

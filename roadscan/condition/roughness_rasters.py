@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.array_types import Float64
-from roadscan.compute.robust import scatter_about
+from roadscan.compute.arrays import scatter_about
 from roadscan.condition.kernels.natural_neighbour import (
     STEP_M,
     circle_centres,

@@ -23,7 +23,7 @@ import numpy.typing as npt
 import shapely
 
 from roadscan.compute.array_types import Float64
-from roadscan.compute.robust import scatter_about
+from roadscan.compute.arrays import scatter_about
 from roadscan.condition.roughness_rasters import (
     IntensityRaster,
     RoadPoints,

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from roadscan.compute.array_types import Float64
-from roadscan.compute.robust import scatter_about
+from roadscan.compute.arrays import scatter_about
 from roadscan.condition.tasks.compare import compared_values
 from roadscan.core.counted import counted
 from roadscan.core.extras import need
@@ -23,7 +23,7 @@ from roadscan.simulate import Scene, simulate, truth
 from roadscan.store.logs import read_log_records
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
-from roadscan.tiles.tasks.cell_files import read_cells
+from roadscan.tiles.cells import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE
 
 _SHOWN: Final = ("mri_m_per_km", "rut_depth_mean_left_mm", "rut_depth_mean_right_mm", "cross_slope_mean_percent")

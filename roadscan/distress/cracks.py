@@ -53,7 +53,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.array_types import Float64, Int64
-from roadscan.compute.ways import way_along
+from roadscan.compute.arrays import way_along
 from roadscan.distress import valleys
 from roadscan.distress.kernels.cross_sections import cross_sections
 from roadscan.distress.kernels.quantiles_along import HALF_ALONG, quantiles_along

@@ -24,8 +24,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Bool, Float64, UInt8
 from roadscan.core.extras import cv2
 from roadscan.distress.kernels.crack_response import thin
 from roadscan.distress.settings import CrackDetection
@@ -40,10 +40,6 @@ from roadscan.distress.valley_lines import (
     lines_through,
 )
 from roadscan.surface.heights import HeightWindow
-
-Float64 = npt.NDArray[np.float64]
-UInt8 = npt.NDArray[np.uint8]
-Bool = npt.NDArray[np.bool_]
 
 _GROWTHS, _LEAP = 20, 7
 """Steps by which valleys grow, a cell each; every seventh step leaps over a cell."""

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from roadscan.core.witness import Finding
     from roadscan.ingest.reading.format import Reject
     from roadscan.inventory.inventory import Inventory
-    from roadscan.run.selection import Selection
+    from roadscan.run.session import Selection
     from roadscan.store.store import Store
     from roadscan.survey.plan import RunPlan
     from roadscan.survey.status import Status
@@ -543,7 +543,7 @@ class _Heard(Reporter):
 
 def _selection(tiles: Sequence[str] | None) -> Selection | None:
     from roadscan.core.grid import TileId
-    from roadscan.run.selection import Selection
+    from roadscan.run.session import Selection
 
     return None if tiles is None else Selection(tuple(map(TileId.parse, tiles)))
 

@@ -21,9 +21,8 @@ from roadscan.navigation.tasks.navigate import records_of
 from roadscan.navigation.tasks.trajectories import load_trajectory
 from roadscan.run.session import Session
 from roadscan.store.schema import table_schema
-from roadscan.tiles.blocks import Block
-from roadscan.tiles.tasks.cell_files import read_cells
-from roadscan.tiles.tasks.tile_plan import TILE, TilePlan, tiles_of
+from roadscan.tiles.cells import read_cells
+from roadscan.tiles.tasks.tile_plan import TILE, Block, TilePlan, tiles_of
 from roadscan.tiles.tasks.tile_points import load_points
 from roadscan.tiles.tasks.wanted_products import product_context
 

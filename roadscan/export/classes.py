@@ -16,14 +16,14 @@ import pyarrow.parquet as pq
 from roadscan.compute.array_types import Int64, UInt8
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.grid import LanePass, TileId
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import ScanGeometry
 from roadscan.core.survey import Survey
 from roadscan.georeference.place import Placed, passes_of
-from roadscan.georeference.plan.centre_line import CentreLineBuffer, load_buffer
 from roadscan.georeference.plan.plan import SurveyPlan, plan_survey
+from roadscan.georeference.plan.road import CentreLineBuffer, load_buffer
 from roadscan.georeference.road_profiles import KEPT, OFF_CENTRE_LINE, OUTSIDE_PASS, READING_CLASSES
 from roadscan.georeference.sources import Georeferencer, RawSlice, geometry_of
-from roadscan.store.damage import UNREADABLE
+from roadscan.store.digest import UNREADABLE
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.tiles.tasks.tile_points import near_lines

@@ -15,7 +15,7 @@ from roadscan import __version__
 from roadscan.compute.array_types import Int64
 from roadscan.core.errors import ConfigError, RunError
 from roadscan.core.gpstime import NS_PER_S, utc_from_gps_ns
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import ScanGeometry
 from roadscan.core.survey import Survey
 from roadscan.export.export import Exported, published, source_in
 from roadscan.formats.scanners.psi import PsiStatement, statement_text

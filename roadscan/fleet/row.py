@@ -21,7 +21,7 @@ from roadscan.core.gpstime import iso_from_gps_ns, utc_from_gps_ns
 from roadscan.fleet.members import Found
 from roadscan.report.blocks import COLOURS, WIDTH, Block, Drawing, Line, MapPage, Paragraph, Part, Table
 from roadscan.report.page import html_page
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import key_of
 from roadscan.store.digest import bytes_hold
 from roadscan.store.history import last_run
 from roadscan.store.logs import DataFile, LogRecord, read_log_records

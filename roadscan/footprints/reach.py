@@ -13,15 +13,15 @@ import pyarrow.parquet as pq
 
 from roadscan.core.errors import NavigationError
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import ScanGeometry
 from roadscan.georeference.charts import charts_along
 from roadscan.georeference.reach import RangeSpans, Reach, Touched, joined
 from roadscan.georeference.sources import MapSettings, RawSlice, ReadingSource, geometry_of
 from roadscan.navigation.tasks.trajectories import load_recorded
 from roadscan.store.codecs.parquet.page_file import opened_parquet
-from roadscan.store.damage import ROWS_CHANGE, damage_named
+from roadscan.store.digest import ROWS_CHANGE, damage_named
 from roadscan.store.readings.packed_returns import box_of, is_packed
-from roadscan.store.readings.profiles import ProfileReader
+from roadscan.store.readings.row_groups import ProfileReader
 from roadscan.store.store import Store
 
 _SPAN_COLUMNS = ["range_low", "range_high"]

@@ -20,8 +20,7 @@ from roadscan.compute.array_types import Float64
 from roadscan.core.crs import LOCAL_WORLD, MapFrame
 from roadscan.core.errors import NavigationError
 from roadscan.core.grid import QUANTA_PER_M
-from roadscan.core.rig import Mounting
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import Mounting, ScanGeometry
 from roadscan.georeference.kernels import readings
 from roadscan.georeference.kernels.flat_profiles import FlatProfiles
 from roadscan.georeference.kernels.readings import Georeference, Limits

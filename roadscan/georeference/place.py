@@ -24,8 +24,7 @@ from roadscan.core.crs import (
 )
 from roadscan.core.errors import CrsError
 from roadscan.core.grid import QUANTA_PER_M, LanePass
-from roadscan.core.rig import Mounting, Mountings
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import Mounting, Mountings, ScanGeometry
 from roadscan.georeference.charts import EVERY_RAW_RANGE, Charts, flat_profiles, georeference_of
 from roadscan.georeference.kernels import readings as kernels
 from roadscan.georeference.kernels.flat_profiles import georeference_flat_profiles

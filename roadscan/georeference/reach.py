@@ -12,8 +12,7 @@ import numpy.typing as npt
 from roadscan.compute.array_types import Float64, Int64, UInt16
 from roadscan.compute.kernel_options import read_only
 from roadscan.core.grid import QUANTA_PER_M
-from roadscan.core.rig import Mounting, Mountings
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import Mounting, Mountings, ScanGeometry
 from roadscan.georeference.charts import Charts, georeference_of
 from roadscan.georeference.kernels.reach import SpannedProfiles, reach_of_profiles, reach_of_returns
 from roadscan.georeference.kernels.readings import Georeference, Limits

@@ -90,8 +90,7 @@ import numpy.typing as npt
 
 from roadscan.compute.array_types import Bool, Float64, Int64, UInt8, UInt16
 from roadscan.compute.kernel_options import read_only
-from roadscan.core.rig import Mounting, Mountings
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import Mounting, Mountings, ScanGeometry
 from roadscan.core.settings.segmentation import RangeFilter, RoadSegmentation, SegmentationConfig
 from roadscan.georeference.kernels.carriageway import CLASS_OFF_ROAD, CLASS_SCATTERED, keep_road
 from roadscan.georeference.kernels.readings import (

@@ -16,8 +16,7 @@ from roadscan.core.crs import Geoid, MapFrame
 from roadscan.core.errors import ConfigError, NavigationError
 from roadscan.core.frames import rotation_from_quaternion
 from roadscan.core.grid import TileGrid
-from roadscan.core.rig import Mounting, Mountings
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import Mounting, Mountings, ScanGeometry
 from roadscan.core.settings.segmentation import RoadSegmentation
 from roadscan.georeference.charts import Charts, charts_along
 from roadscan.georeference.place import (
@@ -37,8 +36,7 @@ from roadscan.navigation.tasks.trajectories import TrajectorySource, load_record
 from roadscan.poses.movement import NO_CORRECTION, Allowance, MountingChange
 from roadscan.poses.trajectory import Trajectory
 from roadscan.store.logs import DataFile
-from roadscan.store.readings.returns import distances_m
-from roadscan.store.readings.row_groups import read_groups
+from roadscan.store.readings.row_groups import distances_m, read_groups
 from roadscan.store.schema import table_schema
 from roadscan.store.small_tables import read_small
 from roadscan.store.store import Store

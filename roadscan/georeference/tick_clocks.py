@@ -25,10 +25,9 @@ from roadscan.navigation.wheel_ticks import (
     WheelTicks,
     judge_ticks,
 )
-from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.bundles import cut_bundles, run_bundles
 from roadscan.run.engine.compute import Compute
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.run.stage import StageState
 from roadscan.store.logs import DataFile, LogRecord
 from roadscan.store.manifest import Manifest, OutputRecord

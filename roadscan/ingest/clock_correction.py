@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from roadscan.compute.array_types import Bool, Float64, Int64
-from roadscan.compute.robust import SIGMA_OF_MAD
+from roadscan.compute.arrays import SIGMA_OF_MAD
 from roadscan.core.clock_evidence import USUAL_DRIFT, Drift
 from roadscan.core.gpstime import NS_PER_S
 

@@ -18,7 +18,7 @@ from roadscan.ingest.reading.format import Item, LogHeader, LogSource, Reject
 from roadscan.ingest.sources import stamp_of
 from roadscan.run.engine.compute import Compute, Done, Inline
 from roadscan.run.session import Session, found_once
-from roadscan.run.telling.teller import in_this_process
+from roadscan.run.telling import in_this_process
 from roadscan.store.logs import (
     DataFile,
     LogRecord,

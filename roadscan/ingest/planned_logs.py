@@ -21,7 +21,7 @@ from roadscan.ingest.pose_checks import FIXES, POSES
 from roadscan.ingest.pose_checks import VERSION as POSE_CHECKS
 from roadscan.ingest.reading.format import LogFormat, LogSource, SourceDefaults
 from roadscan.ingest.sources import Known, Sources, open_sources
-from roadscan.run.engine.fingerprint import grid_key, key_of
+from roadscan.run.keys import grid_key, key_of
 from roadscan.run.session import Session, found_once
 from roadscan.store.logs import has_log, read_log_records
 from roadscan.store.schema import table_schema

@@ -13,13 +13,13 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from roadscan.compute.array_types import Bool, Float64, Int64
-from roadscan.compute.robust import scatter_about
+from roadscan.compute.arrays import scatter_about
 from roadscan.core.witness import Finding, Witness
 from roadscan.ingest.kernels.laser_ranges import by_firing, residuals
 from roadscan.ingest.log_check import LogCheck
 from roadscan.ingest.reading.format import LogHeader, Rows
 from roadscan.store.readings.packed_returns import PACKED, farthest_m
-from roadscan.store.readings.returns import distances_m, sensor_xyz_m
+from roadscan.store.readings.row_groups import distances_m, sensor_xyz_m
 from roadscan.store.writer import LogWriter
 
 LASER_RANGE: Final = Witness(

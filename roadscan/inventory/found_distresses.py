@@ -15,8 +15,8 @@ import numpy.typing as npt
 import pyarrow as pa
 import shapely
 
-from roadscan.assets.object_table import object_names
-from roadscan.assets.tasks.along_roads import along_roads
+from roadscan.assets.kind import object_names
+from roadscan.assets.tasks.tables import along_roads
 from roadscan.assets.visibility import BANDS_M, PASSES
 from roadscan.compute.array_types import Float64, Int64
 from roadscan.condition.tasks.lines import survey_roads
@@ -27,10 +27,10 @@ from roadscan.inventory.state import reference_points
 from roadscan.run.session import Session
 from roadscan.store.asset_schema import AssetColumn, AssetSchema, asset_kind_names, asset_schema
 from roadscan.store.manifest import OutputRecord, read_recorded
+from roadscan.tiles.cells import Level, overview_factors
 from roadscan.tiles.mosaics.products import StoredTiles
 from roadscan.tiles.product import ProductContext, TileSummary
 from roadscan.tiles.products.geo_table import in_crs_unit, read_geo_table
-from roadscan.tiles.pyramid import Level, overview_factors
 from roadscan.tiles.tasks.tile_figures import summary_of
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE
 from roadscan.tiles.tasks.wanted_products import product_context

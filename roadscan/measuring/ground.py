@@ -12,12 +12,11 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.array_types import Float64
-from roadscan.compute.robust import scatter_about
+from roadscan.compute.arrays import scatter_about
 from roadscan.core.grid import Bounds, TileGrid, TileId
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.store import Store
-from roadscan.tiles.pyramid import overview_factors
-from roadscan.tiles.tasks.cell_files import read_cells, read_overview
+from roadscan.tiles.cells import overview_factors, read_cells, read_overview
 from roadscan.tiles.tasks.tile_figures import summary_of
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE
 

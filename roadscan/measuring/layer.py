@@ -26,16 +26,15 @@ from roadscan.measuring.ground import Ground
 from roadscan.measuring.measure import ground_hits
 from roadscan.measuring.poses import PicturePoses, omega_phi_kappa_deg, picture_poses, yaw_pitch_roll_deg
 from roadscan.navigation.tasks.recorded_pictures import TakenPictures
-from roadscan.pictures.frames.chosen import camera_pictures
+from roadscan.pictures.exposures import camera_pictures
 from roadscan.pictures.lens import rays_of
 from roadscan.pictures.placed import plan_pictures
 from roadscan.pictures.views import HEIGHT, WIDTH, Lens, PictureRule
 from roadscan.store.manifest import OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
-from roadscan.tiles.product import ProductContext
+from roadscan.tiles.product import ProductContext, publish_file
 from roadscan.tiles.products.geo_table import read_geo_table, write_geo_table
-from roadscan.tiles.tasks.tile_files import publish_file
 
 _A_SIDE: Final = 8
 """Rays along each side of a picture."""

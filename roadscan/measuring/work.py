@@ -17,8 +17,7 @@ from roadscan.measuring.layer import ListedPictures, PictureRows, Unplaced, list
 from roadscan.measuring.measure import survey_ground
 from roadscan.measuring.poses import PicturePoses
 from roadscan.measuring.settings import PicturesConfig
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.run.session import Session, found_once
 from roadscan.tiles.tasks.wanted_products import product_context
 

@@ -28,7 +28,7 @@ from scipy.ndimage import binary_closing, median_filter
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from roadscan.compute.array_types import Bool, Float64, Int64
-from roadscan.compute.flags import runs_of
+from roadscan.compute.arrays import runs_of
 from roadscan.core.errors import NavigationError
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.core.settings.navigation import SplineConfig

@@ -20,8 +20,7 @@ from roadscan.navigation.tasks.clocks import estimate_clocks
 from roadscan.navigation.tasks.navigate import navigate, records_of
 from roadscan.navigation.tasks.navigation_status import navigation_status, trajectory_findings
 from roadscan.navigation.tasks.recorded_pictures import keep_file, remove_others
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.run.session import Session, manifest_of
 from roadscan.run.stage import Stage, StageState
 from roadscan.store.logs import LogRecord, read_log_records

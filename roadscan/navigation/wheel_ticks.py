@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from roadscan.compute.array_types import Bool, Float64, Int64
-from roadscan.compute.robust import scatter_about
+from roadscan.compute.arrays import scatter_about
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.poses.leaps import rotation_vectors
 

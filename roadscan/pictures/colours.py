@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.array_types import Float64, UInt8
-from roadscan.pictures.frames.chosen import read_picture
+from roadscan.pictures.exposures import read_picture
 from roadscan.pictures.placed import Pictures
 from roadscan.pictures.views import NO_VIEW, Shown, best_views, sampled
 from roadscan.store.codecs.image_files import ImageError

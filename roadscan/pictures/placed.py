@@ -24,7 +24,7 @@ from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory
 from roadscan.georeference.sources import change_of, load_mounting_changes, load_mountings
 from roadscan.navigation.tasks.recorded_pictures import TakenPictures
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_trajectory
-from roadscan.pictures.frames.chosen import camera_pictures, folder_of
+from roadscan.pictures.exposures import camera_pictures, folder_of
 from roadscan.pictures.lens import changed, clock_ns, load_camera_changes, row_ns
 from roadscan.pictures.views import Lens, PictureRule, Views
 from roadscan.poses.trajectory import Poses, world_from_ned

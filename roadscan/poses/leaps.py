@@ -19,7 +19,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from roadscan.compute.array_types import Bool, Float64, Int64
-from roadscan.compute.flags import runs_of
+from roadscan.compute.arrays import runs_of
 from roadscan.core.gpstime import NS_PER_S
 
 FASTEST_M_PER_S: Final = 70.0

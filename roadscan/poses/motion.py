@@ -14,8 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from roadscan.compute.array_types import Bool, Float64, Int64
-from roadscan.compute.flags import runs_of
-from roadscan.compute.robust import scatter_about
+from roadscan.compute.arrays import runs_of, scatter_about
 from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
 from roadscan.core.frames import rotation_from_quaternion, rph_from_rotation
 from roadscan.core.gpstime import NS_PER_S

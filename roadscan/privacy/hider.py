@@ -30,8 +30,7 @@ from roadscan.pictures.placed import Pictures
 from roadscan.pictures.views import HEIGHT, WIDTH
 from roadscan.privacy.detector import KINDS, Detector, Region, hidden
 from roadscan.privacy.settings import PrivacyConfig
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.run.session import Session, found_once
 from roadscan.store.digest import file_digest
 from roadscan.store.manifest import OutputRecord, read_recorded

@@ -17,8 +17,7 @@ from roadscan.inventory.of_survey import commits_of
 from roadscan.navigation.tasks.recorded_pictures import keep_file
 from roadscan.report.blocks import Paragraph, Part
 from roadscan.report.section import Material, Section, sections
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.run.session import Session
 from roadscan.site.report_copy import REPORT
 from roadscan.store.digest import bytes_digest

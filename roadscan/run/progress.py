@@ -15,8 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 from roadscan.core.counted import counted, time_in_words
 from roadscan.core.private_folder import cache_place
 from roadscan.run.session import Reporter
-from roadscan.run.telling.events import Progressed, Said
-from roadscan.run.telling.teller import Teller
+from roadscan.run.telling import Progressed, Said, Teller
 
 _EVERY_S = 5.0
 """Least time between two lines, or two events, of a stage's progress (s): a person reads each."""

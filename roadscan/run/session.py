@@ -8,13 +8,29 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self, TypeVar, cast
 
-from roadscan.core.errors import StoreError, may_pass
+from roadscan.core.errors import ConfigError, StoreError, may_pass
+from roadscan.core.grid import Bounds, TileId
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Compute, Inline
-from roadscan.run.selection import Selection
-from roadscan.run.telling.teller import Teller
+from roadscan.run.telling import Teller
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
+
+
+class SelectionError(ConfigError):
+    """The selection names something that the survey does not have; the store is unchanged."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """A selection of tiles; its parts are combined."""
+
+    named: tuple[TileId, ...] = ()
+    box: Bounds | None = None
+    """Box on the map (m)."""
+    span_gps_ns: tuple[int, int] | None = None
+    """Selects tiles that readings of this span may have touched."""
+
 
 T = TypeVar("T")
 

@@ -37,7 +37,7 @@ from roadscan.tiles.kernels.octree import (
     cut_cell,
     parts_of_edge,
 )
-from roadscan.tiles.products.cloud_records import SCALE_M, Lattice, layout_of, picked, records_of, without_colours
+from roadscan.tiles.products.las import SCALE_M, Lattice, layout_of, picked, records_of, without_colours
 
 _SQUARE_M: Final = 16.0
 """Approximate edge of the squares into which larger tiles are divided."""

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Final, TypeAlias
 
 from roadscan.core.plugins import found_kinds
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import key_of
 from roadscan.site.material import Material
 
 _ESCAPED: Final = {ord(one): f"\\u{ord(one):04x}" for one in "<>&"}

@@ -19,7 +19,7 @@ from roadscan.georeference.plan.plan import SurveyPlan, plan_of
 from roadscan.inventory.of_survey import truth_of
 from roadscan.inventory.state import State
 from roadscan.privacy.settings import PrivacyConfig
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import key_of
 from roadscan.run.session import Session
 from roadscan.store.asset_schema import asset_schema
 from roadscan.store.manifest import OutputRecord, read_recorded

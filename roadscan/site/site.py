@@ -15,8 +15,7 @@ import numpy as np
 from roadscan.compute.array_types import Float64
 from roadscan.core.crs import MapFrame, crs_from_text
 from roadscan.core.errors import ConfigError, RoadscanError
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.site.document import Ask, Document, json_document, site_parts
 from roadscan.site.material import SHEET_M, Box, Material
 from roadscan.site.parts.catalog import from_longitude_latitude, to_longitude_latitude

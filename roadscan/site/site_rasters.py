@@ -20,10 +20,10 @@ from roadscan.compute.array_types import Float32
 from roadscan.core.errors import StoreError
 from roadscan.core.grid import TileGrid, TileId
 from roadscan.core.strict import Strict
+from roadscan.tiles.cells import overview_factors
 from roadscan.tiles.product import LoadCells, TileSummary
 from roadscan.tiles.products.hillshade import HillshadeOptions, shade
 from roadscan.tiles.products.pavement import IntensityOptions, ShadedOptions
-from roadscan.tiles.pyramid import overview_factors
 
 Raster: TypeAlias = Literal["height", "hillshade", "intensity", "pavement_intensity", "pavement_shaded"]
 RASTERS: Final[tuple[Raster, ...]] = ("height", "hillshade", "intensity")

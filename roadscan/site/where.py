@@ -15,7 +15,7 @@ from roadscan.georeference.plan.plan import plan_of, poses_plan_of
 from roadscan.measuring.measure import pixel_covariance, posed_pictures
 from roadscan.pictures.views import PictureRule, sights
 from roadscan.run.session import Session
-from roadscan.tiles.tasks.cell_files import read_cells
+from roadscan.tiles.cells import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE
 
 REACH_M: Final = 60.0

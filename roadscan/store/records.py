@@ -14,8 +14,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from pydantic_core import from_json
 
-from roadscan.store.damage import UNREADABLE
-from roadscan.store.digest import check_seal, sealed_parquet, without_seal
+from roadscan.store.digest import UNREADABLE, check_seal, sealed_parquet, without_seal
 
 RECORDS: Final = pa.schema(
     [

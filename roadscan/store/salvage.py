@@ -14,8 +14,7 @@ import pyarrow.parquet as pq
 
 from roadscan.core.errors import StoreError, may_pass
 from roadscan.core.gpstime import iso_from_gps_ns
-from roadscan.store.damage import UNREADABLE
-from roadscan.store.digest import checked_json, parse_checked
+from roadscan.store.digest import UNREADABLE, checked_json, parse_checked
 from roadscan.store.logs import DataFile, data_file
 from roadscan.store.readings.packed_returns import stored_schema
 from roadscan.store.store import Store

@@ -31,8 +31,7 @@ import pyarrow.parquet as pq
 
 from roadscan.core.errors import DamagedError, FullDiskError, RoadscanError, StoreError
 from roadscan.core.extras import need
-from roadscan.store.damage import UNREADABLE
-from roadscan.store.digest import check_seal, without_seal
+from roadscan.store.digest import UNREADABLE, check_seal, without_seal
 from roadscan.store.holders import Look, at_once, look_of, looking, own_tag, tag_lives
 from roadscan.store.lease import FolderPlace, Lease, ObjectPlace, changed_s
 from roadscan.store.written_by import VERSION_FILE, refuse_newer, version_of

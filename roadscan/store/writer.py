@@ -21,7 +21,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.compute.array_types import Int64
-from roadscan.compute.kernels.profile_bounds import range_bounds
+from roadscan.compute.kernels.arrays import range_bounds
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.witness import Finding
 from roadscan.store.digest import file_digest

@@ -16,7 +16,7 @@ from typing import Final, Literal, NamedTuple, Self
 import numpy as np
 
 from roadscan.compute.array_types import Float64, Int64
-from roadscan.compute.robust import scatter_about
+from roadscan.compute.arrays import scatter_about
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.poses.movement import LevelPoses
 

@@ -13,8 +13,7 @@ import numpy as np
 
 from roadscan.adjust.settings import AdjustConfig
 from roadscan.adjust.tasks.near import PlacedReadings, placed_readings
-from roadscan.compute.robust import scatter_about
-from roadscan.compute.ways import way_along
+from roadscan.compute.arrays import scatter_about, way_along
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.grid import TileId
 from roadscan.footprints.footprints import PRODUCT as FOOTPRINTS
@@ -25,15 +24,13 @@ from roadscan.georeference.sources import READING_COLUMNS, Georeferencer, MapSet
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded, median_pose_sigma
 from roadscan.poses.movement import level_poses
 from roadscan.poses.trajectory import Trajectory
-from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.bundles import run_bundles
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.run.session import Session
 from roadscan.store.logs import DataFile
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.store import Store
-from roadscan.strips.lag import Lag, lag_of
-from roadscan.strips.strip import HALF_WIDTH_M, Strip, Way
+from roadscan.strips.strip import HALF_WIDTH_M, Lag, Strip, Way, lag_of
 from roadscan.strips.tilt import Sway, Tilt, tilts_of
 from roadscan.tiles.tasks.tile_plan import tiles_of
 

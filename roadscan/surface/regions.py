@@ -40,7 +40,7 @@ import shapely
 from pydantic import Field
 
 from roadscan.compute.array_types import Bool, Float64, UInt8
-from roadscan.compute.ways import way_along
+from roadscan.compute.arrays import way_along
 from roadscan.core.grid import QUANTA_PER_M, TileGrid, TileId
 from roadscan.core.strict import Strict
 from roadscan.surface.kernels import coarse as kernels

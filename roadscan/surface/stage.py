@@ -31,12 +31,10 @@ from roadscan.surface.tasks.surface_plan import (
     plan_surfaces,
 )
 from roadscan.surface.tasks.surfaces import compute_surfaces
-from roadscan.tiles.product import SurfaceProduct
-from roadscan.tiles.tasks.selection import chosen_tiles
-from roadscan.tiles.tasks.tile_files import surface_file_names
+from roadscan.tiles.product import SurfaceProduct, surface_file_names
 from roadscan.tiles.tasks.tile_plan import TilePlan, tiles_of
 from roadscan.tiles.tasks.tiles import run_tasks
-from roadscan.tiles.tasks.wanted_products import product_context, wanted_surface_products
+from roadscan.tiles.tasks.wanted_products import chosen_tiles, product_context, wanted_surface_products
 
 
 class Surfaces(Stage):

@@ -38,8 +38,7 @@ from roadscan.core.rig import SensorKind
 from roadscan.core.survey import ControlConfig, LogConfig, Survey
 from roadscan.core.witness import Witness
 from roadscan.georeference.place import CloudFrame
-from roadscan.georeference.plan.centre_line import CentreLines, load_buffer
-from roadscan.georeference.plan.road import looks_across
+from roadscan.georeference.plan.road import CentreLines, load_buffer, looks_across
 from roadscan.ingest.epoch_order import one_stamp_logs
 from roadscan.ingest.inspect.diagnosis import cannot_be_opened, claimed_format, is_there
 from roadscan.ingest.overlap import (
@@ -61,7 +60,7 @@ from roadscan.navigation.tasks.clocks import check_clocks
 from roadscan.navigation.tasks.navigation_logs import unknown_imu, unknown_way
 from roadscan.navigation.tasks.odometry_trajectory import LOCAL_MAP
 from roadscan.pictures.frames.stage import no_folder_of_frames
-from roadscan.run.selection import Selection
+from roadscan.run.session import Selection
 from roadscan.run.stage import stage_named, stages
 from roadscan.store.logs import has_log, read_log_records
 from roadscan.store.store import Store

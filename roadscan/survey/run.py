@@ -14,8 +14,7 @@ from roadscan.georeference.plan.plan import NothingToPlaceError
 from roadscan.ingest.planned_logs import logs_of
 from roadscan.navigation.tasks.navigate import known_keys
 from roadscan.run.engine.compute import damaged_file, rare_collections
-from roadscan.run.selection import SelectionError
-from roadscan.run.session import Session
+from roadscan.run.session import SelectionError, Session
 from roadscan.run.stage import Stage, findings_of, stages
 from roadscan.run.told import told_run, told_stage
 from roadscan.store.holders import look_again

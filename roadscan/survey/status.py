@@ -22,7 +22,7 @@ from roadscan.navigation.tasks.navigate import known_keys
 from roadscan.run.engine.compute import rare_collections
 from roadscan.run.session import Session
 from roadscan.run.stage import StageState, findings_of, stages
-from roadscan.store.damage import UNREADABLE
+from roadscan.store.digest import UNREADABLE
 from roadscan.store.history import history_faults
 from roadscan.store.logs import LogRecord, copy_path, has_log, read_log_records, record_path
 from roadscan.store.manifest import Manifest, OutputRecord, read_failures

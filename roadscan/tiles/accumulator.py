@@ -8,18 +8,27 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.compute.kernels.height_slots import LANES, SLOT_HEIGHTS, SLOT_SIZE, VECTOR
+from roadscan.compute.kernels.column_statistics import LANES
+from roadscan.compute.kernels.slots import SLOT_HEIGHTS, SLOT_SIZE, VECTOR
 from roadscan.core.errors import RoadscanError
 from roadscan.core.grid import QUANTUM_M, TileGrid, TileId
+from roadscan.georeference.cloud import TilePoints
 from roadscan.georeference.kernels.readings import FATES
+from roadscan.georeference.kernels.timed_readings import CHUNK
 from roadscan.run.memory import MOST_CELL_BYTES
 from roadscan.tiles.cells import TileCells, TileEvidence
+from roadscan.tiles.kernels import accumulate
 from roadscan.tiles.kernels import cell_statistics as finishing
-from roadscan.tiles.kernels import pool as kernels
-from roadscan.tiles.kernels.accumulate import PIECE, CountingWork, Heights, accumulate_cells, work_arrays
-from roadscan.tiles.kernels.bucket_statistics import MOST, finish_buckets, row_arrays
-from roadscan.tiles.kernels.cell_columns import CellColumns
-from roadscan.tiles.kernels.cell_statistics import AHEAD, find_groups, finish_cells
+from roadscan.tiles.kernels.accumulate import (
+    PIECE,
+    CountingWork,
+    Heights,
+    accumulate_cells,
+    accumulate_points,
+    work_arrays,
+)
+from roadscan.tiles.kernels.bucket_statistics import MOST, bucket_points, finish_buckets, row_arrays
+from roadscan.tiles.kernels.cell_statistics import AHEAD, CellColumns, find_groups, finish_cells
 from roadscan.tiles.kernels.row_buckets import BLOCK, PASS, ActiveTiles, Buckets, sizes_of_rows, take_readings
 
 ROBUST_FLOOR_QUANTA: Final = 100.0
@@ -56,10 +65,10 @@ class Pool:
         return sum(a.nbytes for a in self.arrays) - self.slots.nbytes  # the headers are views of the slots
 
     @property
-    def arrays(self) -> kernels.Pool:
+    def arrays(self) -> accumulate.Pool:
         """The elements in the form that kernels take."""
         headers = self.slots.view(np.uint64)
-        return kernels.Pool(self.slots, headers, self.bases, self.chain, self.free, self.spare, self.held)
+        return accumulate.Pool(self.slots, headers, self.bases, self.chain, self.free, self.spare, self.held)
 
     def make_room(self, elements: int, most_bytes: int) -> bool:
         """Grow until so many elements are free; return False where that would take more than `most_bytes`."""
@@ -178,7 +187,7 @@ class Accumulator:
         )  # fmt: skip
 
     def run(
-        self, kernel: Callable[[ActiveTiles, kernels.Pool, CountingWork, int], int], items: int, elements: int
+        self, kernel: Callable[[ActiveTiles, accumulate.Pool, CountingWork, int], int], items: int, elements: int
     ) -> None:
         """Call `kernel` with the active tiles, the pool, work and the first item until all items are done.
 
@@ -254,7 +263,7 @@ class Accumulator:
         take_readings(self._ends[row], buckets, across * edge, along * edge, readings, passes, intensity)
         told = np.zeros(FATES, np.int64)  # counted by outcome when they were put into buckets
 
-        def count(active: ActiveTiles, pool: kernels.Pool, work: CountingWork, first: int) -> int:
+        def count(active: ActiveTiles, pool: accumulate.Pool, work: CountingWork, first: int) -> int:
             done: int = accumulate_cells(readings, passes, intensity, active, pool, work, told, first)
             return done
 
@@ -352,3 +361,56 @@ class RowBuckets:
         self.records = np.empty(size * BLOCK, np.uint64)
         self.before, self.sizes, self.owners = (np.empty(size, np.int32) for _ in range(3))
         self.free = np.arange(size, dtype=np.int32)
+
+
+_SAMPLE: Final = 1 << 16
+"""Number of points from which the order is determined."""
+_MOST_CHANGES: Final = 256
+"""With more changes of the pass than this, points are not put into buckets: each change closes a block of every row."""
+
+
+def cells_of(points: TilePoints, grid: TileGrid) -> TileCells:
+    """Return statistics of every cell with a point, independent of the order of the points to the bit.
+
+    Sums are made of whole 10 µm, so they are exact. The squared deviations of one cell stay below 2⁶³ for
+    up to 250,000 points spread over 60 m of height, and for more where the spread is less.
+
+    Points that come cell by cell, as along a profile, are counted as they come; others by way of buckets.
+
+    Parameters
+    ----------
+    points : at least one.
+    """
+    tile, n = points.tile, len(points)
+    ids = points.pass_id
+    one = bool((ids == ids[0]).all())
+    accumulator = Accumulator(grid, [tile], ids[:1] if one else np.unique(ids), most_bytes=1 << 40)
+    accumulator.activate([tile])
+    passes = np.zeros(n, np.int32) if one else np.searchsorted(accumulator.passes, ids).astype(np.int32)
+    x, y, height = (np.ascontiguousarray(a) for a in (points.x_quanta, points.y_quanta, points.height_quanta))
+    intensity = np.ascontiguousarray(points.intensity)
+
+    def count(active: ActiveTiles, pool: accumulate.Pool, work: CountingWork, first: int) -> int:
+        done: int = accumulate_points(x, y, height, passes, intensity, active, pool, work, first)
+        return done
+
+    def fill(active: ActiveTiles, buckets: Buckets, first: int) -> int:
+        own = active.ends[active.rows[0, 0]]
+        done: int = bucket_points(x, y, height, passes, intensity, grid.cell_quanta, own, buckets, first)
+        return done
+
+    mixed = not one and np.count_nonzero(np.diff(passes)) > _MOST_CHANGES
+    if mixed or _cell_by_cell(x, y, grid.cell_quanta):
+        accumulator.run(count, n, 2 * PIECE)
+    else:
+        accumulator.fill(fill, n, CHUNK)
+    finished = accumulator.finish(tile)
+    if finished is None:
+        raise ValueError(f"tile {tile} holds no point")
+    return finished[0]
+
+
+def _cell_by_cell(x: npt.NDArray[np.int32], y: npt.NDArray[np.int32], cell_quanta: int) -> bool:
+    """Return whether half of the points lie in the cell of the point before."""
+    column, row = x[:_SAMPLE] // cell_quanta, y[:_SAMPLE] // cell_quanta
+    return bool(2 * np.count_nonzero((np.diff(column) == 0) & (np.diff(row) == 0)) >= len(column))

@@ -11,7 +11,7 @@ import datetime as dt
 import functools
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Final, Literal, Protocol, Self, TypeAlias
@@ -23,10 +23,13 @@ from roadscan.core.plugins import found_kinds
 from roadscan.core.strict import Strict
 from roadscan.georeference.cloud import TilePoints
 from roadscan.pictures.views import PictureRule
+from roadscan.run.keys import key_of
+from roadscan.store.digest import file_digest
+from roadscan.store.manifest import OutputRecord
+from roadscan.store.store import Store
 from roadscan.surface.tile import SurfaceTile
-from roadscan.tiles.cells import CellValues, TileCells
+from roadscan.tiles.cells import CellValues, Level, TileCells, overview_factors, pyramid_of
 from roadscan.tiles.lane_direction import LaneDirections
-from roadscan.tiles.pyramid import Level, overview_factors, pyramid_of
 
 ENTRY_POINT_GROUP: Final = "roadscan.products"
 """Entry-point group through which a third party's package adds a product."""
@@ -124,7 +127,7 @@ class LoadCells(Protocol):
     def overview(self, tile: TileId, factor: int) -> Level | None:
         """Return the overview of a tile in pixels of `factor` squared cells, or None where the survey has no such tile.
 
-        `factor` is one of :func:`roadscan.tiles.pyramid.overview_factors`.
+        `factor` is one of :func:`roadscan.tiles.cells.overview_factors`.
         """
 
     def file(self, product: str, tile: TileId) -> bytes | None:
@@ -285,3 +288,79 @@ def product_named(name: str) -> Product:
     if name not in known:
         raise ConfigError(f"unknown product '{name}'{nearest(name, known)}", expected="one of: " + ", ".join(known))
     return known[name]
+
+
+@dataclass(frozen=True)
+class WantedFiles:
+    """A product of one file per tile, with its settings and the key of its inputs besides the tile's."""
+
+    product: TileFiles
+    options: Strict
+    key: str
+
+    @functools.cached_property
+    def files(self) -> dict[str, str]:
+        """Suffix of each file by its name in the manifest; that of the product itself is the last."""
+        beside = self.product.companions(self.options)
+        named = {f"{self.product.name}.{name}": suffix for name, suffix in beside.items()}
+        return {**named, self.product.name: self.product.suffix_for(self.options)}
+
+
+@dataclass(frozen=True)
+class WantedProduct(WantedFiles):
+    """A product made from the tiles' readings."""
+
+    product: TileProduct
+
+
+@dataclass(frozen=True)
+class WantedSurface(WantedFiles):
+    """A product made from the reconstructed surface."""
+
+    product: SurfaceProduct
+
+
+def write_product(
+    wanted: WantedProduct, tile: Tile, context: ProductContext, key: str, store: Store, folder: Path
+) -> list[OutputRecord]:
+    """Write a product of a tile in `folder` and publish its files; `key` is the tile's."""
+    write = functools.partial(wanted.product.write, tile, wanted.options, context)
+    return publish_product(wanted, str(tile.cells.tile), write, key, store, folder)
+
+
+def publish_product(
+    wanted: WantedFiles, unit: str, write: Callable[[Path], None], key: str, store: Store, folder: Path
+) -> list[OutputRecord]:
+    """Let `write` make a tile's file in `folder`, and publish it with its companions; `key` is the tile's."""
+    product = wanted.product
+    path = folder / f"tile{product.suffix_for(wanted.options)}"
+    write(path)
+    own_key = key_of(key, wanted.key)
+    return [
+        publish_file(store, path.with_suffix(suffix), f"tiles/{product.name}/{unit}{suffix}", name, unit, own_key)
+        for name, suffix in wanted.files.items()
+    ]
+
+
+def publish_file(
+    store: Store, path: Path, target: str, product: str, unit: str, key: str, detail: str = ""
+) -> OutputRecord:
+    """Move a finished file into the store; return its record for the manifest."""
+    size, digest = path.stat().st_size, file_digest(path)
+    store.publish(path, target)
+    return OutputRecord(product, unit, key, target, size, digest, detail)
+
+
+def tile_file_names(names: Collection[str] | None = None) -> set[str]:
+    """Return the names in the manifest of the files of tile products: of all products, or of those named."""
+    return _file_names([p for p in products().values() if isinstance(p, TileProduct)], names)
+
+
+def surface_file_names(names: Collection[str] | None = None) -> set[str]:
+    """Return the names of the files of surface products likewise."""
+    return _file_names([p for p in products().values() if isinstance(p, SurfaceProduct)], names)
+
+
+def _file_names(known: Sequence[TileFiles], names: Collection[str] | None) -> set[str]:
+    chosen = [p for p in known if names is None or p.name in names]
+    return {file for p in chosen for file in WantedFiles(p, p.options(), "").files}

@@ -20,14 +20,11 @@ from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState, check_stages_ahead
 from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import Manifest, OutputRecord
-from roadscan.tiles.product import TileProduct
-from roadscan.tiles.tasks.passes_apart import apart_findings
-from roadscan.tiles.tasks.selection import chosen_tiles
-from roadscan.tiles.tasks.tile_figures import reading_counts, tile_figures
-from roadscan.tiles.tasks.tile_files import tile_file_names
+from roadscan.tiles.product import TileProduct, tile_file_names
+from roadscan.tiles.tasks.tile_figures import apart_findings, reading_counts, tile_figures
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, TilePlan, TileTask, stale_tiles, tiles_of
 from roadscan.tiles.tasks.tiles import compute_tiles, run_tasks
-from roadscan.tiles.tasks.wanted_products import product_context, wanted_tile_products
+from roadscan.tiles.tasks.wanted_products import chosen_tiles, product_context, wanted_tile_products
 
 
 class Tiles(Stage):

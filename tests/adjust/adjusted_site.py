@@ -18,7 +18,7 @@ from roadscan.store.query.sql import query
 from roadscan.store.small_tables import small_path
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
-from roadscan.tiles.tasks.cell_files import read_cells
+from roadscan.tiles.cells import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE
 from tests.surveys import Lines, Simulated, changed
 

@@ -18,7 +18,7 @@ from roadscan.report.blocks import Picture, Table
 from roadscan.report.section import Material
 from roadscan.report.sections.adjustment import Adjustment
 from roadscan.run.engine.compute import Done, Inline
-from roadscan.run.engine.embedded import embedded
+from roadscan.run.engine.compute_on import embedded
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate.surface import Surface

@@ -13,8 +13,17 @@ from scipy.spatial.transform import Rotation
 from benchmarks.bench_reference_site import BestEstimate, errors
 from benchmarks.drawn_road import Road, control, drawn_errors, ties
 from roadscan.adjust.adjustment import Adjustment, AdjustmentSettings, adjust
-from roadscan.adjust.observations import COMPONENTS, FIXED, KINDS, Observations, partials
-from roadscan.adjust.process import GaussMarkov, MountingPrior, RunPrior, knots_of
+from roadscan.adjust.observations import (
+    COMPONENTS,
+    FIXED,
+    KINDS,
+    GaussMarkov,
+    MountingPrior,
+    Observations,
+    RunPrior,
+    knots_of,
+    partials,
+)
 from roadscan.adjust.sparse_normal import NormalEquations
 from roadscan.core.errors import ConfigError
 

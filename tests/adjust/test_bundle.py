@@ -14,8 +14,7 @@ from roadscan.adjust.adjustment import Adjustment, adjust
 from roadscan.adjust.bundle.measurements import Measurements, Numbers, State, met_at, residuals_px, rows_of, seen
 from roadscan.adjust.bundle.outcome import FreeCameras, free_cameras
 from roadscan.adjust.bundle.solve import Approached, PictureEvidence, approached, state_of
-from roadscan.adjust.observations import CAMERA, Observations
-from roadscan.adjust.process import CameraPrior, GaussMarkov, MountingPrior, RunPrior
+from roadscan.adjust.observations import CAMERA, CameraPrior, GaussMarkov, MountingPrior, Observations, RunPrior
 from roadscan.adjust.settings import AdjustmentSettings
 from roadscan.core.crs import LOCAL_WORLD
 from roadscan.core.frames import ENU_FROM_NED

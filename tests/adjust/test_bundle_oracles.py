@@ -20,8 +20,7 @@ from scipy.spatial.transform import Rotation
 from roadscan.adjust.adjustment import Adjustment, adjust
 from roadscan.adjust.bundle.measurements import Rows, met_at, seen
 from roadscan.adjust.bundle.solve import PictureEvidence, approached, state_of
-from roadscan.adjust.observations import CAMERA, Observations
-from roadscan.adjust.process import CameraPrior, MountingPrior
+from roadscan.adjust.observations import CAMERA, CameraPrior, MountingPrior, Observations
 from roadscan.adjust.settings import AdjustmentSettings
 from roadscan.core.frames import ENU_FROM_NED
 from roadscan.core.rig import Interior

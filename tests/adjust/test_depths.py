@@ -13,8 +13,7 @@ from roadscan.adjust.adjustment import adjust
 from roadscan.adjust.bundle.depths import NearReturns, Surfaces, depth_rows, surfaces_of
 from roadscan.adjust.bundle.measurements import State, met_at, seen
 from roadscan.adjust.bundle.solve import Approached, approached, state_of
-from roadscan.adjust.observations import Observations
-from roadscan.adjust.process import MountingPrior
+from roadscan.adjust.observations import MountingPrior, Observations
 from roadscan.adjust.settings import AdjustmentSettings
 from roadscan.poses.trajectory import Corrections
 from tests.adjust import test_bundle

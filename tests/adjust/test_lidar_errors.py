@@ -10,9 +10,8 @@ import numpy.typing as npt
 import pytest
 
 from roadscan.adjust.adjustment import CommonErrors, adjust
-from roadscan.adjust.observations import COMMON, KINDS, Observations
+from roadscan.adjust.observations import COMMON, KINDS, GaussMarkov, Observations, RunPrior
 from roadscan.adjust.places import Track
-from roadscan.adjust.process import GaussMarkov, RunPrior
 from roadscan.adjust.settings import AdjustmentSettings
 from roadscan.adjust.tasks.mountings import Mounted
 from roadscan.adjust.tasks.tie_work import lidar_error_findings, lidar_error_lines

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from roadscan.adjust.adjustment import adjust
-from roadscan.adjust.observations import COMMON, KINDS, Observations
+from roadscan.adjust.observations import COMMON, KINDS, GaussMarkov, Observations, RunPrior
 from roadscan.adjust.patches import PassReadings
 from roadscan.adjust.places import Place, Traverse
-from roadscan.adjust.process import GaussMarkov, RunPrior
 from roadscan.adjust.settings import AdjustmentSettings, TieSettings
 from roadscan.adjust.ties.at_place import Ties, ties_at
 

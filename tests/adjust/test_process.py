@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 
 from roadscan.adjust.adjustment import adjust
-from roadscan.adjust.observations import Observations
-from roadscan.adjust.process import GaussMarkov, RunPrior, StatedSigma, knots_of, line_variance, precision_of
+from roadscan.adjust.observations import (
+    GaussMarkov,
+    Observations,
+    RunPrior,
+    StatedSigma,
+    knots_of,
+    line_variance,
+    precision_of,
+)
 from roadscan.adjust.settings import AdjustmentSettings
 from roadscan.core.errors import ConfigError
 

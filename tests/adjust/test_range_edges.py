@@ -28,8 +28,7 @@ from roadscan.adjust.bundle.edge_boresight import (
 )
 from roadscan.adjust.bundle.solve import approached
 from roadscan.adjust.kernels.range_edges import continued, scores_of_turns
-from roadscan.adjust.observations import Observations
-from roadscan.adjust.process import CameraPrior, GaussMarkov, MountingPrior, RunPrior
+from roadscan.adjust.observations import CameraPrior, GaussMarkov, MountingPrior, Observations, RunPrior
 from roadscan.adjust.settings import AdjustmentSettings
 from roadscan.adjust.tasks.edge_scores import boresight_findings
 from roadscan.core.rig import Interior

@@ -36,8 +36,7 @@ from roadscan.report.page import report_page
 from roadscan.report.section import Material
 from roadscan.report.sections.assets import Assets as AssetsSection
 from roadscan.run.engine.compute import Done, Inline
-from roadscan.run.selection import Selection
-from roadscan.run.session import Session
+from roadscan.run.session import Selection, Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene as Street
 from roadscan.simulate import simulate

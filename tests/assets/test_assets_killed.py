@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from roadscan.run.engine.embedded import embedded
+from roadscan.run.engine.compute_on import embedded
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.simulate import Scene, simulate

@@ -10,14 +10,11 @@ import pytest
 
 from roadscan.assets import classes
 from roadscan.assets.ground.bare_earth import ground_returns
-from roadscan.assets.ground.filling import filled
-from roadscan.assets.ground.grid import Grid
-from roadscan.assets.ground.morphological import opened
-from roadscan.assets.ground.settings import GroundSettings
-from roadscan.assets.ground.surface import Place, is_dense
-from roadscan.assets.ground.undersides import undersides
+from roadscan.assets.ground.dense import undersides
+from roadscan.assets.ground.surface import Grid, Place, filled, is_dense, opened
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.scene import Box
+from roadscan.assets.settings import GroundSettings
 from roadscan.simulate import Scene as Street
 from tests.assets.airborne import airborne
 from tests.assets.edges.streets import returns_of

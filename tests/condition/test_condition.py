@@ -31,7 +31,7 @@ from roadscan.condition.tasks.work import MADE, plan_condition
 from roadscan.core.errors import ConfigError
 from roadscan.distress.products.cracks import COLUMNS as CRACKS
 from roadscan.georeference.plan.plan import plan_of
-from roadscan.run.code_reach import name_of
+from roadscan.run.keys import name_of
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.store.digest import bytes_digest
@@ -39,8 +39,8 @@ from roadscan.store.manifest import OutputRecord
 from roadscan.store.query.sql import query
 from roadscan.store.schema import table_schema
 from roadscan.store.writer import parquet_bytes
+from roadscan.tiles.cells import read_cells
 from roadscan.tiles.products.geo_table import write_geo_table
-from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE
 from roadscan.tiles.tasks.wanted_products import product_context
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import shapely
 
-from roadscan.compute.edges.painted_line import painted_line, without_lines
+from roadscan.compute.edges import painted_line, without_lines
 from roadscan.condition.kernels.lane_texture import FIGURES, INTENSITY, SHARE, TEXTURE, texture_of_squares
 from roadscan.condition.kernels.sampling import MOST_CELLS, Cells, CellTable, gather, mean_intensities
 from roadscan.condition.lane_data import RavelledSection, TextureSquares, lane_lines, texture_squares

@@ -21,7 +21,7 @@ from roadscan.core.survey import Survey
 from roadscan.demo.demo import prepare_demo
 from roadscan.formats.cameras.video import look_into
 from roadscan.inventory.homes.postgis import PostGis
-from roadscan.run.engine.embedded import embedded
+from roadscan.run.engine.compute_on import embedded
 from roadscan.simulate import Scene, simulate
 from roadscan.store.store import Store
 from tests.conftest import REPOSITORY

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from roadscan.assets.tasks.plan import cut_squares
 from roadscan.core.grid import Bounds, TileGrid, TileId
-from roadscan.tiles.blocks import Block, cut_blocks
+from roadscan.tiles.tasks.tile_plan import Block, cut_blocks
 
 GRID = TileGrid(10.0, 0.05)
 coordinate = st.floats(-6e6, 6e6, allow_nan=False)

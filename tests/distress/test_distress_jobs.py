@@ -13,15 +13,15 @@ from roadscan.core.errors import ConfigError, RoadscanError
 from roadscan.core.grid import TileGrid, TileId
 from roadscan.core.survey import Survey
 from roadscan.georeference.plan.plan import plan_survey
-from roadscan.run.code_reach import name_of, reached_code
 from roadscan.run.engine.compute import Inline
+from roadscan.run.keys import name_of, reached_code
 from roadscan.run.session import Session
 from roadscan.simulate.truth import load
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import OutputRecord
 from roadscan.store.store import Store
 from roadscan.survey.run import run_stages
-from roadscan.tiles.drives import Drives
+from roadscan.tiles.lane_direction import Drives
 from roadscan.tiles.mosaics import products
 from roadscan.tiles.mosaics.products import StoredTiles
 from roadscan.tiles.product import ProductContext, product_named

@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.core.errors import ConfigError, FormatError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
-from roadscan.core.rig import Sensor
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import ScanGeometry, Sensor
 from roadscan.ingest.reading.format import LogSource, Reject, Rows, format_named, format_of
 from roadscan.store.schema import table_schema
 

@@ -12,7 +12,7 @@ import pytest
 
 from roadscan.core.errors import ConfigError, FormatError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import ScanGeometry
 from roadscan.formats.scanners.sick_telegrams import Checksums, checksum, encode_scans, find_telegrams, read_pieces
 from roadscan.ingest.reading.format import format_named, format_of
 from tests.formats.readings import Readings, read

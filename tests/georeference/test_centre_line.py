@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import shapely
 
-from roadscan.georeference.plan.centre_line import CentreLineBuffer
+from roadscan.georeference.plan.road import CentreLineBuffer
 
 BOX = (0.0, 0.0, 10.0, 10.0)
 

@@ -14,8 +14,8 @@ import shapely
 
 from roadscan.core.errors import ConfigError, CrsError
 from roadscan.core.survey import Survey
-from roadscan.georeference.plan.centre_line import CentreLineBuffer, CentreLines, load_buffer
 from roadscan.georeference.plan.plan import plan_survey
+from roadscan.georeference.plan.road import CentreLineBuffer, CentreLines, load_buffer
 from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
 from roadscan.run.stage import stages

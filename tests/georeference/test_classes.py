@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 from scipy.spatial.transform import Rotation
 
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import ScanGeometry
 from roadscan.georeference.place import EVERYWHERE, Window
 from roadscan.georeference.road_profiles import READING_CLASSES
 from tests.georeference.test_place import metres, placement, returns, scene

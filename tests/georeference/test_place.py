@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.core.crs import Anchor, MapFrame, world_frame_of
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.core.rig import Mountings, Sensor
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import Mountings, ScanGeometry, Sensor
 from roadscan.georeference.charts import charts_along
 from roadscan.georeference.place import EVERYWHERE, HeightLimits, Placement, Window, pass_numbers, passes_of
 from roadscan.poses.trajectory import Trajectory

@@ -12,8 +12,7 @@ from pyproj import Transformer
 from scipy.spatial.transform import Rotation
 
 from roadscan.core.crs import Anchor, MapFrame, world_frame_of
-from roadscan.core.rig import Mountings, Sensor
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import Mountings, ScanGeometry, Sensor
 from roadscan.georeference.charts import charts_along
 from roadscan.georeference.place import HeightLimits, Placement
 from roadscan.georeference.reach import RangeSpans, Reach, Touched

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import ScanGeometry
 from roadscan.core.settings.segmentation import SegmentationConfig
 from roadscan.georeference.kernels.segmentation import height_threshold
 from roadscan.georeference.road_profiles import LAS_CLASSES, READING_CLASSES, segmented

@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from roadscan.core.crs import LOCAL_WORLD
-from roadscan.core.rig import Mounting, Mountings
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import Mounting, Mountings, ScanGeometry
 from roadscan.core.settings.segmentation import RangeFilter, RoadSegmentation
 from roadscan.georeference.road_profiles import OVERLAPPING, WINDOW_NS, RoadFinder, turn_limits
 from roadscan.poses.trajectory import Trajectory

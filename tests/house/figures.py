@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-from roadscan.run.code_reach import reached_code
+from roadscan.run.keys import reached_code
 
 LIBRARY = Path(__file__).resolve().parents[2] / "roadscan"
 

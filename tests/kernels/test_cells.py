@@ -5,28 +5,34 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.compute.kernels.copies import copy_values
-from roadscan.compute.kernels.height_slots import LANES, SLOT_SIZE, VECTOR
+from roadscan.compute.kernels.arrays import BINS, bounds_of, copy_values, smallest, sort_few
+from roadscan.compute.kernels.column_statistics import LANES
+from roadscan.compute.kernels.slots import SLOT_SIZE, VECTOR
 from roadscan.georeference.kernels.readings import FATES, KEPT
 from roadscan.georeference.kernels.timed_readings import CHUNK
 from roadscan.tiles.kernels import cell_statistics
 from roadscan.tiles.kernels.accumulate import (
     PIECE,
     Heights,
+    Pool,
     accumulate,
     accumulate_cells,
     accumulate_points,
     find_cells,
     work_arrays,
 )
-from roadscan.tiles.kernels.adjacent_cells import run_end
 from roadscan.tiles.kernels.bucket_statistics import bucket_points, finish_buckets, row_arrays
-from roadscan.tiles.kernels.cell_columns import CellColumns, select_arrays, statistics_of_full
-from roadscan.tiles.kernels.cell_statistics import AHEAD, find_groups, finish_cells
+from roadscan.tiles.kernels.cell_statistics import (
+    AHEAD,
+    CellColumns,
+    find_groups,
+    finish_cells,
+    select_arrays,
+    statistics_of_full,
+)
 from roadscan.tiles.kernels.decimate import Cells
 from roadscan.tiles.kernels.grey_pictures import grey_intensity, shade_cells, shade_raster
-from roadscan.tiles.kernels.pool import Pool
-from roadscan.tiles.kernels.pyramid import Levels, Pixels, reduce_cells
+from roadscan.tiles.kernels.pyramid import Levels, Pixels, reduce_cells, run_end
 from roadscan.tiles.kernels.row_buckets import (
     BLOCK,
     PASS,
@@ -38,7 +44,6 @@ from roadscan.tiles.kernels.row_buckets import (
     sizes_of_rows,
     take_readings,
 )
-from roadscan.tiles.kernels.selection import BINS, bounds_of, smallest, sort_few
 
 EDGE, CELL = 20, 500
 GROUPS = EDGE * 2

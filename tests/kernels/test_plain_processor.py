@@ -23,7 +23,7 @@ AVX2 = {
 
 REGISTERS = """
 import numpy as np
-from roadscan.compute.kernels.cell_streaks import sum_up
+from roadscan.compute.kernels.streaks import sum_up
 intensity, sums = np.arange(100, dtype=np.uint8), np.zeros(101, np.uint32)
 sum_up(intensity, sums)
 assert (sums[1:] == np.cumsum(intensity)).all()

@@ -8,26 +8,25 @@ import numpy as np
 import pytest
 
 from roadscan.compute.kernel_options import bare
-from roadscan.compute.kernels.cell_streaks import find_streaks, sum_up
-from roadscan.compute.kernels.column_statistics import LANES, medians_of_16, statistics_of_64
-from roadscan.compute.kernels.covariances import PEAK, RISE, covariances, slope_covariances
+from roadscan.compute.kernels.column_statistics import LANES, medians_of_16, statistics_of_64, store_group
+from roadscan.compute.kernels.covariances import LANES as EIGHT
+from roadscan.compute.kernels.covariances import PEAK, RISE, TOGETHER, covariances, factorise, slope_covariances
 from roadscan.compute.kernels.covariances import REACH as COVARIANCE_REACH
-from roadscan.compute.kernels.factorisation import LANES as EIGHT
-from roadscan.compute.kernels.factorisation import TOGETHER, factorise
-from roadscan.compute.kernels.height_slots import (
+from roadscan.compute.kernels.patch_heights import POINTS, SCALE, heights_of_eight
+from roadscan.compute.kernels.slots import (
     LIGHT_SHIFT,
     MARK_SHIFT,
     SLOT_HEIGHTS,
     SLOT_SIZE,
     VECTOR,
+    chained_cells,
+    open_group,
     prefetch,
+    put_apart,
     store_heights,
 )
-from roadscan.compute.kernels.patch_heights import POINTS, SCALE, heights_of_eight
-from roadscan.compute.kernels.slot_groups import chained_cells, open_group, put_apart
-from roadscan.compute.kernels.store_statistics import store_group
-from roadscan.compute.kernels.streak_slots import AT_ONCE, find_known_slots, lowest_bit
-from roadscan.tiles.kernels.cell_columns import CellColumns
+from roadscan.compute.kernels.streaks import AT_ONCE, find_known_slots, find_streaks, lowest_bit, sum_up
+from roadscan.tiles.kernels.cell_statistics import CellColumns
 
 
 @bare

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from roadscan.compute.kernels.column_statistics import LANES, REACH
-from roadscan.compute.kernels.slot_statistics import slot_statistics_of_8, slot_statistics_of_28
+from roadscan.compute.kernels.slots import slot_statistics_of_8, slot_statistics_of_28
 
 
 def _expected(heights: Any, light: int, base: int, floor: float) -> list[float]:

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.calibrate.kernels.surface_patches import place, splat
 from roadscan.calibrate.kernels.ties import SIDE, tie_residuals, tie_rows
+from roadscan.compute.kernels.arrays import range_bounds
 from roadscan.compute.kernels.curved_grid import accumulate_curved, thin_path
-from roadscan.compute.kernels.profile_bounds import range_bounds
 from roadscan.distress.kernels.crack_response import add_bend, deepen, fill_holes, line_sums, thin
 from roadscan.georeference.kernels.carriageway import keep_road
 from roadscan.georeference.kernels.tile_set import add_tile, block_ranges, empty, mark_zonotope, take, tile_set

@@ -21,9 +21,8 @@ from distributed.comm import connect
 
 from roadscan.core.errors import ConfigError, RunError
 from roadscan.core.private_folder import UnsafeFolderError
-from roadscan.run.engine import embedded as embedded_module
-from roadscan.run.engine.compute_on import compute_on
-from roadscan.run.engine.embedded import embedded
+from roadscan.run.engine import compute_on as embedded_module
+from roadscan.run.engine.compute_on import compute_on, embedded
 from roadscan.run.engine.on_dask import OnDask
 
 PATIENCE_S = 3.0
@@ -123,7 +122,7 @@ def test_code_that_waits_in_dasks_usual_folder_is_not_loaded(tmp_path: Path) -> 
     (usual / "planted.py").write_text("")
     ask = (
         "from tests.run.test_closed_doors import has_planted\n"
-        "from roadscan.run.engine.embedded import embedded\n"
+        "from roadscan.run.engine.compute_on import embedded\n"
         "if __name__ == '__main__':\n"
         "    with embedded(1) as opened:\n"
         "        assert not next(iter(opened.map(has_planted, [0]))).result\n"

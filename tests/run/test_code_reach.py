@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from roadscan.run import code_reach
-from roadscan.run.code_reach import CARRIERS, code_digest, reached_code
+from roadscan.run import keys
+from roadscan.run.keys import CARRIERS, code_digest, reached_code
 
 PARTS = {
     "__init__.py": "",
@@ -64,7 +64,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def forget() -> None:
-    for known in (code_reach._file_of, code_reach._module, code_reach._digest_of, code_reach._kept_outlines):
+    for known in (keys._file_of, keys._module, keys._digest_of, keys._kept_outlines):
         known.cache_clear()
 
 
@@ -168,7 +168,7 @@ def test_an_entry_that_is_gone_is_told() -> None:
 
 def test_every_carrier_exists() -> None:
     for carrier in CARRIERS:
-        code_reach._place_of(carrier)
+        keys._place_of(carrier)
 
 
 def test_the_tiles_reach_what_shapes_them_and_no_settings_of_other_stages() -> None:
@@ -202,7 +202,7 @@ def test_outlines_are_kept_for_the_next_process(package: Path, tmp_path: Path, m
     before = digest()
     (kept,) = tmp_path.glob("kept/roadscan/outlines-*/added_package.maker.json")
     with monkeypatch.context() as patch:
-        patch.setattr(code_reach.ast, "parse", None)
+        patch.setattr(keys.ast, "parse", None)
         assert digest() == before
     whole = kept.read_bytes()
     for damaged in (b"", b"{}", whole[:50], whole.replace(b'"brought"', b'"other"')):

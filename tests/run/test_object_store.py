@@ -15,8 +15,7 @@ from roadscan.core.errors import RunError, StoreError, may_pass
 from roadscan.core.grid import TileId
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Inline
-from roadscan.run.selection import Selection
-from roadscan.run.session import Session
+from roadscan.run.session import Selection, Session
 from roadscan.run.stage import stages
 from roadscan.store.holders import look_of
 from roadscan.store.manifest import Manifest

@@ -16,11 +16,10 @@ from distributed import Client, LocalCluster
 
 import roadscan
 from roadscan.core.errors import RoadscanError, RunError
-from roadscan.run.engine import embedded as own_cluster
-from roadscan.run.engine.embedded import embedded
+from roadscan.run.engine import compute_on
+from roadscan.run.engine.compute_on import embedded
 from roadscan.run.engine.on_dask import OnDask
-from roadscan.run.telling.events import Listener, UnitEnded
-from roadscan.run.telling.teller import Teller, ToldCompute
+from roadscan.run.telling import Listener, Teller, ToldCompute, UnitEnded
 
 DEADLY = 7
 
@@ -86,7 +85,7 @@ def test_a_scheduler_that_dies_while_it_is_asked_is_named(tmp_path: Path) -> Non
 
 
 def test_workers_that_are_gone_for_good_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(own_cluster, "_LOST_S", 0.5)
+    monkeypatch.setattr(compute_on, "_LOST_S", 0.5)
     with embedded(1) as alone:
         dask_cluster = alone._client.cluster
         (nanny,) = dask_cluster.workers.values()

@@ -13,7 +13,7 @@ import pytest
 
 from roadscan.core.errors import ConfigError
 from roadscan.core.gpstime import Clock, TimeSystem, gps_ns_from_utc
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import ScanGeometry
 from roadscan.ingest.reading.format import Reject, format_named
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.run import SimulatedSurvey

@@ -55,8 +55,8 @@ from roadscan.site.thumbnail import thumbnail
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import OutputRecord
 from roadscan.survey.run import run_stages
+from roadscan.tiles.cells import read_cells
 from roadscan.tiles.products.geo_table import write_geo_table
-from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tile_plan import TILE
 from tests.drawing import drawn
 from tests.inventory.streets import EAST, NORTH, asset, found

@@ -18,10 +18,10 @@ from rasterio.enums import Resampling
 from roadscan.core.errors import ConfigError, StoreError
 from roadscan.core.grid import TileGrid, TileId
 from roadscan.store.codecs.mesh import write_glb
+from roadscan.surface.products.surface_mesh import mesh_of
 from roadscan.surface.regions import INTERPOLATED, MEASURED
 from roadscan.surface.tile import EMPTY, GridWindow, SurfaceTile
 from roadscan.tiles.product import ProductContext, product_named
-from roadscan.tiles.products.mesh import mesh_of
 from tests.workshop import Place, Workshop
 
 GRID = TileGrid(10.0, 0.05)

@@ -24,8 +24,7 @@ from roadscan.core.errors import ConfigError
 from roadscan.core.grid import TileId
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Compute, Done, Inline
-from roadscan.run.selection import Selection
-from roadscan.run.session import Session
+from roadscan.run.session import Selection, Session
 from roadscan.run.stage import stages
 from roadscan.simulate import simulate
 from roadscan.simulate.truth import load

@@ -13,8 +13,7 @@ from roadscan.core.errors import RoadscanError, RunError
 from roadscan.core.grid import TileId
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import Inline
-from roadscan.run.selection import Selection
-from roadscan.run.session import Session
+from roadscan.run.session import Selection, Session
 from roadscan.run.stage import stages
 from roadscan.store.logs import copy_path, read_log_records, record_path
 from roadscan.store.manifest import Manifest

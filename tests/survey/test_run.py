@@ -25,16 +25,15 @@ from roadscan.core.survey import Survey
 from roadscan.ingest.ingest import ingest
 from roadscan.run.engine.compute import Inline
 from roadscan.run.engine.compute_on import compute_on
-from roadscan.run.selection import Selection
-from roadscan.run.session import Session
+from roadscan.run.session import Selection, Session
 from roadscan.run.stage import stages
 from roadscan.store.logs import read_log_records
 from roadscan.store.manifest import Manifest
 from roadscan.store.query.sql import connect, query
 from roadscan.store.store import Store
 from roadscan.survey.status import survey_status, verify_store
-from roadscan.tiles.blocks import Block
 from roadscan.tiles.stage import plan_tile_work
+from roadscan.tiles.tasks.tile_plan import Block
 from roadscan.tiles.tasks.tile_points import load_points
 from tests.conftest import REPOSITORY
 from tests.surveys import Simulated, changed, outputs
@@ -400,7 +399,7 @@ def test_a_tile_that_could_not_be_made_again_counts_as_stale(
         raise OSError("disk full")
 
     with monkeypatch.context() as patch:
-        patch.setattr("roadscan.tiles.statistics.cells_of", broken)
+        patch.setattr("roadscan.tiles.accumulator.cells_of", broken)
         with pytest.raises(RunError, match=rf"tiles {unit}: OSError: disk full"):
             copy.run(selection=Selection(named=(TileId.parse(unit),)))
     assert survey_status(Session(Survey.load(copy.survey_file), store)).of("tiles").stale == 1

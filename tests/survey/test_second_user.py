@@ -29,7 +29,7 @@ pytestmark = [pytest.mark.nightly, pytest.mark.timeout(900)]
 WAIT_S = 120.0
 
 CLUSTERS = {
-    "roadscan": "from roadscan.run.engine.embedded import embedded as cluster",
+    "roadscan": "from roadscan.run.engine.compute_on import embedded as cluster",
     "Dask": "from functools import partial\nfrom distributed import LocalCluster\n"
     "cluster = partial(LocalCluster, threads_per_worker=1, dashboard_address=':0')",
 }

@@ -18,10 +18,16 @@ from roadscan.store.codecs.parquet.number_table import Lists, write_number_group
 from roadscan.store.manifest import OutputRecord
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
-from roadscan.tiles.cells import TileCells
-from roadscan.tiles.pyramid import overview_factors, pyramid_of
-from roadscan.tiles.statistics import cells_of
-from roadscan.tiles.tasks.cell_files import read_cells, read_overview, write_cells, write_overviews
+from roadscan.tiles.accumulator import cells_of
+from roadscan.tiles.cells import (
+    TileCells,
+    overview_factors,
+    pyramid_of,
+    read_cells,
+    read_overview,
+    write_cells,
+    write_overviews,
+)
 
 GRID = TileGrid(10.0, 0.125)
 ALWAYS = ["column", "row", "count", "height_robust_m", "intensity_mean"]

@@ -8,8 +8,7 @@ import pytest
 
 from roadscan.core.errors import ConfigError
 from roadscan.core.grid import TileId
-from roadscan.tiles.cells import TileCells
-from roadscan.tiles.pyramid import Level, overview_factors, pyramid_of
+from roadscan.tiles.cells import Level, TileCells, overview_factors, pyramid_of
 
 
 def cells(edge: int, filled: float, seed: int = 3, height_m: float = 3_500.0) -> TileCells:

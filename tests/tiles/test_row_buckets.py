@@ -10,9 +10,8 @@ import pytest
 from roadscan.core.grid import TileGrid, TileId
 from roadscan.georeference.cloud import TilePoints
 from roadscan.georeference.kernels.readings import CLASS_KEPT, CLASS_TOO_HIGH, FATES, KEPT, OUTSIDE, Placed
-from roadscan.tiles.accumulator import Accumulator
+from roadscan.tiles.accumulator import Accumulator, cells_of
 from roadscan.tiles.kernels.row_buckets import TAKEN, ActiveTiles, Buckets, Measured, Places, fill_buckets
-from roadscan.tiles.statistics import cells_of
 
 GRID = TileGrid(10.0, 0.5)
 TILE, OTHER, NOT_ACTIVE = TileId(-3, 7), TileId(-2, 7), TileId(-3, 8)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from roadscan.core.grid import TileGrid, TileId
 from roadscan.georeference.cloud import TilePoints
-from roadscan.tiles.statistics import cells_of
+from roadscan.tiles.accumulator import cells_of
 
 GRID = TileGrid(10.0, 0.5)
 

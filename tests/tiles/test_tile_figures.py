@@ -9,7 +9,7 @@ import pytest
 
 from roadscan.core.grid import TileId
 from roadscan.georeference.reading_counts import LogCounts
-from roadscan.run.engine.fingerprint import key_of, keys_beside
+from roadscan.run.keys import key_of, keys_beside
 from roadscan.store.manifest import CHANGED, DAMAGED, MISSING, Manifest, OutputRecord
 from roadscan.store.store import Store
 from roadscan.tiles.tasks.tile_figures import summary_of, tile_figures

@@ -7,9 +7,8 @@ from pathlib import Path
 from roadscan.core.strict import Strict
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
-from roadscan.tiles.product import Tile, TileProduct
+from roadscan.tiles.product import Tile, TileProduct, WantedProduct, tile_file_names, write_product
 from roadscan.tiles.products.pavement import IntensityOptions, PavementIntensity
-from roadscan.tiles.tasks.tile_files import WantedProduct, tile_file_names, write_product
 
 
 class Pair(TileProduct):

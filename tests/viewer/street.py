@@ -18,7 +18,7 @@ from roadscan.site.layer import title_of
 from roadscan.site.parts import edits
 from roadscan.store.codecs.copc import CopcWriter
 from roadscan.store.codecs.mesh import Mesh, write_glb
-from roadscan.tiles.products.cloud_records import layout_of
+from roadscan.tiles.products.las import layout_of
 
 Float64 = npt.NDArray[np.float64]
 

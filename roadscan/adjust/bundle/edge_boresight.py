@@ -24,8 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.kernels.range_edges import continued, scores_of_turns
-from roadscan.adjust.observations import CAMERA, COMPONENTS, FIXED, KINDS, MOUNTED, Observations
-from roadscan.adjust.process import MountingPrior
+from roadscan.adjust.observations import CAMERA, COMPONENTS, FIXED, KINDS, MOUNTED, MountingPrior, Observations
 from roadscan.compute.array_types import Float32, Float64, UInt8
 from roadscan.core.extras import cv2
 from roadscan.pictures.lens import PARAMETERS, derivatives

@@ -23,8 +23,7 @@ from roadscan.adjust.bundle.edge_boresight import EdgeBoresight
 from roadscan.adjust.bundle.measurements import Measurements, State, met_at, residuals_px, seen
 from roadscan.adjust.bundle.solve import Approached, PictureEvidence, entering, places, sharing, state_of
 from roadscan.adjust.control import ControlPoint
-from roadscan.adjust.observations import CAMERA, COMPONENTS, KINDS, Observations
-from roadscan.adjust.process import CameraPrior, MountingPrior
+from roadscan.adjust.observations import CAMERA, COMPONENTS, KINDS, CameraPrior, MountingPrior, Observations
 from roadscan.adjust.settings import AdjustmentSettings
 from roadscan.compute.array_types import Float64
 from roadscan.core.canvas import empty_figure

@@ -23,8 +23,7 @@ from roadscan.adjust.bundle.measurements import (
     seen,
 )
 from roadscan.adjust.estimation import igg_iii
-from roadscan.adjust.observations import KINDS, Observations
-from roadscan.adjust.process import CameraPrior, MountingPrior, RunPrior
+from roadscan.adjust.observations import KINDS, CameraPrior, MountingPrior, Observations, RunPrior
 from roadscan.adjust.settings import AdjustmentSettings
 from roadscan.calibrate.robust import length_limit
 from roadscan.compute.array_types import Bool, Float64, Int64

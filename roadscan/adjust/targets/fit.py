@@ -18,7 +18,7 @@ from roadscan.adjust.kernels import target_shapes as kernels
 from roadscan.adjust.kernels.target_shapes import EAST, NORTH, SIZE, TURN, UNKNOWNS
 from roadscan.adjust.targets.shapes import Cells, Disc, Shape
 from roadscan.compute.array_types import Float64
-from roadscan.compute.robust import scatter_about
+from roadscan.compute.arrays import scatter_about
 
 _SECTORS: Final = 36
 """Sectors around the centre; labels of one sector are one piece of evidence."""

@@ -10,8 +10,8 @@ import numpy as np
 from roadscan.adjust.settings import TargetSettings
 from roadscan.adjust.targets.shapes import HeightFind, SurveyedLine, TargetReadings, height_at
 from roadscan.compute.array_types import Bool, Float64
-from roadscan.compute.edges.painted_line import LINE_M, painted_line, without_lines
-from roadscan.compute.robust import scatter_about
+from roadscan.compute.arrays import scatter_about
+from roadscan.compute.edges import LINE_M, painted_line, without_lines
 
 _SLICES: Final = 8
 """Slices along the line that are measured separately: their scatter gives the σ of their mean."""

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from roadscan.adjust.settings import TargetSettings
 from roadscan.compute.array_types import Float64, Int64, UInt8
-from roadscan.compute.robust import SIGMA_OF_MAD
+from roadscan.compute.arrays import SIGMA_OF_MAD
 from roadscan.core.errors import ConfigError
 
 

@@ -11,10 +11,9 @@ import numpy as np
 
 from roadscan.adjust.bundle.outcome import residuals_of
 from roadscan.adjust.control import NAMED, ControlPoint, Sighting
-from roadscan.adjust.picture import AdjustmentPicture, Residuals
+from roadscan.adjust.observations import RunPrior
 from roadscan.adjust.places import Place, Track, places_of_overlap
-from roadscan.adjust.process import RunPrior
-from roadscan.adjust.quality import NSSDA_CHECK_POINTS
+from roadscan.adjust.quality import NSSDA_CHECK_POINTS, AdjustmentPicture, Residuals
 from roadscan.adjust.settings import AdjustConfig, PlaceSettings
 from roadscan.adjust.tasks.bundle import AskedOfPictures, pictures_key, pictures_of
 from roadscan.adjust.tasks.cameras import (
@@ -103,9 +102,8 @@ from roadscan.georeference.plan.plan import SurveyPlan, poses_plan_of
 from roadscan.georeference.plan.road import road_key
 from roadscan.navigation.tasks.recorded_pictures import NOT_DRAWN
 from roadscan.poses.movement import largest
-from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.bundles import run_bundles
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.run.session import Session
 from roadscan.store.digest import file_digest
 from roadscan.store.manifest import CHANGED, DAMAGED, MISSING, Manifest, OutputRecord

@@ -10,7 +10,7 @@ import numpy as np
 from roadscan.adjust.bundle.measurements import Measurements, Numbers
 from roadscan.adjust.bundle.solve import PictureEvidence
 from roadscan.adjust.control import ControlPoint
-from roadscan.adjust.process import CameraPrior
+from roadscan.adjust.observations import CameraPrior
 from roadscan.adjust.settings import AdjustConfig, CameraPriors
 from roadscan.adjust.tasks.edge_scores import (
     RETURNS,
@@ -32,8 +32,7 @@ from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory
 from roadscan.georeference.plan.road import road_key
 from roadscan.georeference.sources import load_mountings
 from roadscan.navigation.tasks.clock_tables import load_clocks
-from roadscan.pictures.exposures import Exposures, exposures_of
-from roadscan.pictures.frames.chosen import camera_pictures
+from roadscan.pictures.exposures import Exposures, camera_pictures, exposures_of
 from roadscan.pictures.points import TABLE, measured_points
 from roadscan.pictures.ties.tracks import TRACKS
 from roadscan.pictures.ties.work import ALL

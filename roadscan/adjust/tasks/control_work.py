@@ -15,14 +15,14 @@ import pyarrow as pa
 import shapely
 
 from roadscan.adjust.control import ControlPoint, PickedPlace, Sighting, WrongPoint, passes_by, sight_shifted
+from roadscan.adjust.observations import RunPrior
 from roadscan.adjust.patches import Shift, shifted
 from roadscan.adjust.places import Track, Traverse
-from roadscan.adjust.process import RunPrior
 from roadscan.adjust.settings import AdjustConfig, LineUse, TargetConfig, TargetSettings
 from roadscan.adjust.targets.shapes import Chequered, Disc, Shape, SurveyedLine
 from roadscan.adjust.tasks.near import Circle, NearFile, NearReader, Sources, near_files
 from roadscan.adjust.tasks.tracks import runs_of
-from roadscan.compute.ways import way_along
+from roadscan.compute.arrays import way_along
 from roadscan.core.errors import ConfigError
 from roadscan.core.frames import rotation_from_rph, rph_from_rotation
 from roadscan.core.gpstime import NS_PER_S
@@ -31,8 +31,7 @@ from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.plan.road import road_key
 from roadscan.georeference.sources import MapSettings
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.readings.row_groups import read_groups

@@ -9,7 +9,7 @@ import numpy as np
 
 from roadscan.adjust.control import NAMED, Sighting, WrongPoint, swapped
 from roadscan.adjust.control_test import COMPONENTS, HEIGHT, PLACE, AppliedOffset, ControlVerdict, PlaneShift
-from roadscan.adjust.process import RunPrior
+from roadscan.adjust.observations import RunPrior
 from roadscan.adjust.unknowns import FixedRun
 from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.counted import listed

@@ -31,11 +31,9 @@ from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.plan.road import road_key
 from roadscan.georeference.sources import Georeferencer, MapSettings, ReadingSource, geometry_of, read_rows
-from roadscan.pictures.exposures import Exposures
-from roadscan.pictures.frames.chosen import read_picture
+from roadscan.pictures.exposures import Exposures, read_picture
 from roadscan.pictures.lens import pixels_of
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.store.codecs.image_files import ImageError
 from roadscan.store.digest import bytes_digest
 from roadscan.store.logs import DataFile

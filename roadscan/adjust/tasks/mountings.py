@@ -12,8 +12,7 @@ import numpy.typing as npt
 
 from roadscan.adjust.adjustment import MountingErrors
 from roadscan.adjust.control_test import APART
-from roadscan.adjust.observations import CAMERA, MOUNTED
-from roadscan.adjust.process import MountingPrior
+from roadscan.adjust.observations import CAMERA, MOUNTED, MountingPrior
 from roadscan.adjust.settings import AdjustConfig, CameraPriors
 from roadscan.adjust.tasks.near import Sources
 from roadscan.adjust.unknowns import sharing

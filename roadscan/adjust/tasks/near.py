@@ -15,7 +15,7 @@ from roadscan.adjust.patches import PassReadings
 from roadscan.adjust.places import Traverse
 from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.grid import QUANTA_PER_M
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import ScanGeometry
 from roadscan.georeference.place import EIGHT_TO_SIXTEEN_BITS, EVERYWHERE, Placement
 from roadscan.georeference.sources import (
     READING_COLUMNS,

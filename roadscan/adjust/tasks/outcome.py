@@ -16,8 +16,8 @@ import pyarrow as pa
 from roadscan.adjust.bundle.outcome import CameraResiduals, draw_residuals
 from roadscan.adjust.observations import KINDS
 from roadscan.adjust.patches import PassReadings, Patch, map_from_level, patch_of
-from roadscan.adjust.picture import AdjustmentPicture, ShownSeam, draw_adjustment, draw_seams
 from roadscan.adjust.places import Place, Traverse
+from roadscan.adjust.quality import AdjustmentPicture, ShownSeam, draw_adjustment, draw_seams
 from roadscan.adjust.settings import TieSettings
 from roadscan.adjust.tasks.near import Circle, NearReader
 from roadscan.adjust.tasks.publication import Held, Rows
@@ -32,7 +32,7 @@ from roadscan.navigation.tasks.recorded_pictures import NOT_DRAWN, keep_file
 from roadscan.poses.movement import MountingChange, Seat
 from roadscan.poses.trajectory import Corrections
 from roadscan.run.engine.compute import Compute, reason_of
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import key_of
 from roadscan.store.codecs.grey_picture import write_png
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord

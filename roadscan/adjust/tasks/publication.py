@@ -26,7 +26,7 @@ from roadscan.adjust.quality import (
 from roadscan.adjust.settings import AdjustConfig
 from roadscan.adjust.tasks.solution import Evidence, Solution
 from roadscan.compute.array_types import Float64, Int64
-from roadscan.compute.ways import way_along
+from roadscan.compute.arrays import way_along
 from roadscan.navigation.tasks.trajectories import CORRECTION_SIGMAS, load_all_corrections
 from roadscan.poses.movement import MountingChange
 from roadscan.poses.trajectory import Corrections

@@ -24,9 +24,17 @@ from roadscan.adjust.control import (
 from roadscan.adjust.control_test import COMPONENTS as _AXES
 from roadscan.adjust.control_test import HEIGHT, PLACE
 from roadscan.adjust.helmert import RigidFit, rigid_fit
-from roadscan.adjust.observations import FIXED, MOUNTED, Observations
+from roadscan.adjust.observations import (
+    FIXED,
+    MOUNTED,
+    CameraPrior,
+    GaussMarkov,
+    Observations,
+    RunPrior,
+    StatedSigma,
+    knots_of,
+)
 from roadscan.adjust.patches import level_from_map
-from roadscan.adjust.process import CameraPrior, GaussMarkov, RunPrior, StatedSigma, knots_of
 from roadscan.adjust.quality import LeaveOneOut, leave_one_out
 from roadscan.adjust.settings import AdjustConfig, AdjustmentSettings, ControlRules, PosePriors
 from roadscan.adjust.targets.shapes import SurveyedLine

@@ -26,8 +26,7 @@ from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.plan.road import road_key
 from roadscan.georeference.sources import MapSettings
 from roadscan.poses.movement import Seat
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema

@@ -24,14 +24,14 @@ from roadscan.adjust.tasks.tie_work import KnownTies, ties_of
 from roadscan.adjust.ties.at_place import Ties
 from roadscan.adjust.ties.tie import HEIGHT
 from roadscan.compute.array_types import Float64, Int64
-from roadscan.compute.robust import scatter_about
+from roadscan.compute.arrays import scatter_about
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.sources import Georeferencer, RawSlice, ReadingSource, geometry_of, read_rows
 from roadscan.navigation.tasks.trajectories import load_recorded
 from roadscan.poses.movement import LevelPoses, level_poses
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import key_of
 from roadscan.store.logs import DataFile
 
 _SHARE = 2.0

@@ -39,7 +39,7 @@ from roadscan.adjust.ties.tie import (
     Tie,
 )
 from roadscan.compute.array_types import Bool, Float64, Int64
-from roadscan.compute.robust import scatter_about
+from roadscan.compute.arrays import scatter_about
 from roadscan.core.gpstime import NS_PER_S
 
 _FLAT: Final = 0.25

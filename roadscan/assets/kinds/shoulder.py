@@ -14,12 +14,11 @@ import shapely
 from pydantic import Field
 
 from roadscan.assets.edges.along_drive import FARTHEST_M, road_edges
-from roadscan.assets.edges.line_pieces import dense
-from roadscan.assets.edges.strips import ribbon
+from roadscan.assets.edges.line_pieces import dense, ribbon
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, KindOptions
 from roadscan.assets.scene import Scene
 from roadscan.compute.array_types import Float64
-from roadscan.compute.ways import way_along
+from roadscan.compute.arrays import way_along
 
 STATION_M = 1.0  # Distance of stations along an edge (m).
 GAP_NODES = 6

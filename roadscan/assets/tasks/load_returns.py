@@ -11,19 +11,16 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.assets.bins import distinct_steps, in_bins
-from roadscan.assets.ground.settings import GroundSettings
 from roadscan.assets.kernels.buckets import rows_within, sort_groups
 from roadscan.assets.make_scene import make_scene
-from roadscan.assets.returns import Returns
-from roadscan.assets.scene import Scene
-from roadscan.assets.statistics import Statistics
+from roadscan.assets.scene import Returns, Scene, Statistics
+from roadscan.assets.settings import GroundSettings
 from roadscan.assets.tiling import AssetGrid
 from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.grid import QUANTA_PER_M, QUANTUM_M, TileId
-from roadscan.core.rig import UNMOUNTED, Mountings
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import UNMOUNTED, Mountings, ScanGeometry
 from roadscan.georeference.place import EIGHT_TO_SIXTEEN_BITS, Located, Window, passes_of
-from roadscan.georeference.plan.centre_line import CentreLineBuffer, load_buffer
+from roadscan.georeference.plan.road import CentreLineBuffer, load_buffer
 from roadscan.georeference.sensor_places import sensor_places
 from roadscan.georeference.sources import READING_COLUMNS, Georeferencer, RawSlice, ReadingSource, geometry_of
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_trajectory

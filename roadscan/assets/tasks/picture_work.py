@@ -13,17 +13,15 @@ import pyarrow as pa
 import shapely
 
 from roadscan.assets.pictures.reader import ColourReader, picture_readers
-from roadscan.assets.pictures.settings import AssetPicturesSettings
+from roadscan.assets.settings import AssetPicturesSettings, picture_rule
 from roadscan.assets.tasks.evidence import SCREENS
 from roadscan.assets.tasks.objects import OBJECTS
-from roadscan.assets.tasks.picture_rule import picture_rule
 from roadscan.assets.tasks.plan import AssetPlan
 from roadscan.assets.tiling import AssetGrid
 from roadscan.core.errors import ConfigError, RunError
 from roadscan.core.grid import Bounds, TileId
 from roadscan.pictures.placed import Pictures, plan_pictures
-from roadscan.run.code_reach import code_digest, name_of
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of, name_of
 from roadscan.store.digest import bytes_digest, file_digest
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.store import Store

@@ -26,8 +26,8 @@ from roadscan.footprints.footprints import footprints_of
 from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session
 from roadscan.store.manifest import Manifest, OutputRecord
-from roadscan.tiles.tasks.selection import chosen_tiles
 from roadscan.tiles.tasks.tile_plan import tiles_of
+from roadscan.tiles.tasks.wanted_products import chosen_tiles
 
 MADE = (
     SAMPLES, GAINS, STATISTICS, EVIDENCE, CLASSIFIED, BARE_EARTH, SCREENS, VISIBILITY, OBJECTS, SEEN, CUT_OUTS, TABLES,

@@ -25,7 +25,7 @@ from roadscan.calibrate.evidence import Known, Seen, Ties, Traverse
 from roadscan.calibrate.surfaces.planes import Pieces, Placed, Readings, level_from_world, placed
 from roadscan.calibrate.unknowns import Estimate, ObjectPose
 from roadscan.compute.array_types import Float64, Int64
-from roadscan.compute.robust import scatter_about
+from roadscan.compute.arrays import scatter_about
 from roadscan.core.errors import NavigationError
 
 Steps = Sequence[tuple[float, float, float]]

@@ -20,8 +20,7 @@ from roadscan.core.survey import Survey
 from roadscan.georeference.plan.plan import DatedMountings, SurveyPlan, plan_survey
 from roadscan.georeference.sources import load_mountings
 from roadscan.navigation.tasks.recorded_pictures import CALIBRATION, NOT_DRAWN, keep_file, picture_key
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.schema import table_schema
 from roadscan.store.small_tables import read_small, small_path, write_small

@@ -21,7 +21,7 @@ from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.crs import LOCAL_WORLD, MapFrame
 from roadscan.core.errors import ConfigError, RunError, nearest
 from roadscan.core.gpstime import Clock, TimeSystem
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import ScanGeometry
 from roadscan.core.settings.calibration import (
     Area,
     CalibrationEvidence,
@@ -41,7 +41,7 @@ from roadscan.navigation.tasks.navigation_logs import imu_readings
 from roadscan.navigation.tasks.trajectories import load_trajectory, usual_pose_sigma
 from roadscan.poses.trajectory import Trajectory, world_from_ned
 from roadscan.store.logs import DataFile
-from roadscan.store.readings.returns import sensor_xyz_m
+from roadscan.store.readings.row_groups import sensor_xyz_m
 
 Span = tuple[int, int]
 

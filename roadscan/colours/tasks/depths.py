@@ -24,14 +24,13 @@ from roadscan.georeference.place import Window
 from roadscan.georeference.sources import Georeferencer
 from roadscan.pictures.colours import ColourSource
 from roadscan.pictures.placed import Pictures
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.store.writer import parquet_bytes
-from roadscan.tiles.tasks.tile_files import publish_file
+from roadscan.tiles.product import publish_file
 from roadscan.tiles.tasks.tile_plan import TileTask
 
 _IMAGES: Final = ("nearest", "farthest", "moved")

@@ -22,18 +22,15 @@ from roadscan.colours.tasks.share import PictureShare, Shares
 from roadscan.core.gpstime import NS_PER_S, utc_from_gps_ns
 from roadscan.core.grid import Bounds, TileGrid, TileId
 from roadscan.pictures.placed import Pictures
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.store.codecs.cog import Band, bytes_image, write_cog
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.store import Store
-from roadscan.tiles.blocks import Block
-from roadscan.tiles.product import ProductContext
+from roadscan.tiles.cells import read_cells
+from roadscan.tiles.product import ProductContext, publish_file
 from roadscan.tiles.products.raster import CellBox, about
-from roadscan.tiles.tasks.cell_files import read_cells
-from roadscan.tiles.tasks.tile_files import publish_file
-from roadscan.tiles.tasks.tile_plan import TILE
+from roadscan.tiles.tasks.tile_plan import TILE, Block
 from roadscan.tiles.tasks.tiles import TaskResult
 
 ORTHOPHOTO: Final = "orthophoto"

@@ -20,11 +20,9 @@ from roadscan.footprints.footprints import FootprintRanges
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.pictures.placed import Pictures, plan_pictures, rule_cameras
 from roadscan.pictures.views import PictureRule
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
-from roadscan.tiles.blocks import Block
+from roadscan.run.keys import code_digest, key_of
 from roadscan.tiles.product import ProductContext
-from roadscan.tiles.tasks.tile_plan import PlannedTiles, TilePlan, TileTask, plan_tiles
+from roadscan.tiles.tasks.tile_plan import Block, PlannedTiles, TilePlan, TileTask, plan_tiles
 from roadscan.tiles.tasks.wanted_products import product_context
 
 DEPTHS: Final = "picture_depths"

@@ -19,14 +19,12 @@ from roadscan.colours.tasks.share import PictureShare, Shares
 from roadscan.core.gpstime import NS_PER_S, utc_from_gps_ns
 from roadscan.core.grid import QUANTUM_M, TileId
 from roadscan.georeference.cloud import TilePoints
-from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import damaged_file, reason_of
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.store.manifest import OutputRecord
-from roadscan.tiles.blocks import Block, cut_blocks
+from roadscan.tiles.product import publish_file
 from roadscan.tiles.products.las import LasOptions, write_las
-from roadscan.tiles.tasks.tile_files import publish_file
-from roadscan.tiles.tasks.tile_plan import TileTask
+from roadscan.tiles.tasks.tile_plan import Block, TileTask, cut_blocks
 from roadscan.tiles.tasks.tile_points import load_points
 from roadscan.tiles.tasks.tiles import TaskResult
 

@@ -14,7 +14,7 @@ from roadscan.colours.tasks.plan import DEPTHS, ColourPlan, numbers_near
 from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.grid import Bounds
 from roadscan.pictures.placed import Pictures
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import key_of
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.store import Store

@@ -2,7 +2,19 @@
 
 from __future__ import annotations
 
-from roadscan.compute.numba_internals import cgutils, ir
+import numba
+
+from roadscan.compute.numba_internals import cgutils, host_features, ir
+
+
+def compiles_for(*features: str) -> bool:
+    """Return True if kernels are compiled for a processor with all these features (LLVM's names)."""
+    stated = numba.config.CPU_FEATURES
+    if numba.config.DISABLE_JIT or (stated is None and numba.config.CPU_NAME is not None):
+        return False
+    known = host_features() if stated is None else stated
+    return {f"+{feature}" for feature in features} <= set(known.split(","))
+
 
 I8, I16, I32, I64 = (ir.IntType(bits) for bits in (8, 16, 32, 64))  # LLVM's types of whole numbers.
 

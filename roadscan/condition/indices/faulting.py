@@ -30,7 +30,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.array_types import Float64
-from roadscan.compute.robust import scatter_about
+from roadscan.compute.arrays import scatter_about
 from roadscan.condition.index import ConditionIndex, Quantity, Value
 from roadscan.condition.kernels.steps import step_heights
 from roadscan.condition.lane_data import LaneData, Profile

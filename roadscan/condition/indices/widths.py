@@ -22,7 +22,7 @@ from typing import ClassVar, Final, NamedTuple
 import numpy as np
 
 from roadscan.compute.array_types import Float64
-from roadscan.compute.robust import scatter_about
+from roadscan.compute.arrays import scatter_about
 from roadscan.condition.edge_raster import STATION_M
 from roadscan.condition.index import ConditionIndex, How, PerCrossSection, Quantity, Value, by_section
 from roadscan.condition.lane_data import SPACING_M, LaneData, LaneLines

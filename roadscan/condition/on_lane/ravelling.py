@@ -12,7 +12,7 @@ import scipy.ndimage
 import shapely
 
 from roadscan.compute.array_types import Bool, Float64
-from roadscan.compute.robust import SIGMA_OF_MAD, scatter_about
+from roadscan.compute.arrays import SIGMA_OF_MAD, scatter_about
 from roadscan.condition.lane_data import SQUARE_M, RavelledPatch, RavelledSection, TextureSquares
 
 LEAST_RATIO: Final = 1.15

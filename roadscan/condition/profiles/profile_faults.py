@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from roadscan.compute.array_types import Bool, Float64
-from roadscan.compute.robust import scatter_about
+from roadscan.compute.arrays import scatter_about
 from roadscan.core.witness import Finding, Witness
 
 PROFILE_SAMPLES: Final = Witness(

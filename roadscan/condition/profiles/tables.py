@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.array_types import Float64
-from roadscan.compute.flags import runs_of
+from roadscan.compute.arrays import runs_of
 from roadscan.condition.profiles.profile_faults import NOTABLE, PROFILE_STEPS, SoundHeights, sound_heights, too_high_by
 from roadscan.condition.profiles.profiles import heights_of, raise_fault, stations_of
 from roadscan.condition.profiles.ride import (

@@ -16,8 +16,7 @@ import numpy.typing as npt
 from pydantic import Field
 
 from roadscan.compute.array_types import Float64
-from roadscan.compute.flags import runs_of
-from roadscan.compute.robust import SIGMA_OF_MAD
+from roadscan.compute.arrays import SIGMA_OF_MAD, runs_of
 from roadscan.condition.profiles.profiles import heights_of, stations_of
 from roadscan.core.errors import ProfileError
 from roadscan.core.strict import Strict

@@ -22,7 +22,7 @@ import pyarrow as pa
 import shapely
 
 from roadscan.compute.array_types import Float64
-from roadscan.compute.robust import scatter_about
+from roadscan.compute.arrays import scatter_about
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.roads import Drive, StatedLine, find_roads
 from roadscan.condition.settings import ConditionConfig
@@ -34,8 +34,7 @@ from roadscan.formats.vectors.road_lines import LineLayer, RoadLinesOptions, pla
 from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
 from roadscan.ingest.reading.format import Reject
 from roadscan.navigation.tasks.trajectories import TrajectorySource, usual_pose_sigma
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import file_digest
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.readings.row_groups import read_groups

@@ -20,8 +20,7 @@ from roadscan.condition.tasks.values import VALUES, Group, GroupTask, load_lane
 from roadscan.condition.wheel_paths import WholeSections
 from roadscan.core.canvas import empty_figure
 from roadscan.core.extras import can_draw
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import file_digest
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema

@@ -19,9 +19,8 @@ from roadscan.condition.tasks.values import Group, GroupTask, load_lane
 from roadscan.core.canvas import empty_figure
 from roadscan.core.extras import can_draw
 from roadscan.navigation.tasks.recorded_pictures import NOT_DRAWN
-from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import damaged_file, reason_of
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import file_digest
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.schema import table_schema

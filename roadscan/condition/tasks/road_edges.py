@@ -31,15 +31,14 @@ from roadscan.core.survey import Survey
 from roadscan.formats.vectors.polygons import check_polygons, read_polygons
 from roadscan.formats.vectors.road_lines import sidecars
 from roadscan.georeference.plan.plan import SurveyPlan
-from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import damaged_file, reason_of
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import bytes_digest, file_digest
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.schema import table_schema
 from roadscan.store.writer import parquet_bytes
+from roadscan.tiles.cells import read_cells
 from roadscan.tiles.products.geo_table import write_geo_table
-from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tiles import TaskResult
 
 EDGES: Final = "road_edge_offsets"

@@ -24,16 +24,14 @@ from roadscan.core.canvas import empty_figure
 from roadscan.core.extras import can_draw
 from roadscan.core.grid import TileGrid, TileId
 from roadscan.navigation.tasks.recorded_pictures import NOT_DRAWN
-from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import damaged_file, reason_of
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import bytes_digest, file_digest
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.schema import table_schema
 from roadscan.store.writer import parquet_bytes
-from roadscan.tiles.cells import TileCells
+from roadscan.tiles.cells import TileCells, read_cells
 from roadscan.tiles.products.geo_table import write_geo_table
-from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tiles import TaskResult
 
 REGIONS: Final = "roughness_regions"

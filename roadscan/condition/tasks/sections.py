@@ -20,8 +20,7 @@ from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.tasks.lines import LANES, LINES, Roads
 from roadscan.condition.tasks.values import VALUES
 from roadscan.core.grid import TileId
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import file_digest
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema

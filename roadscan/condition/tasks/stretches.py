@@ -24,9 +24,8 @@ from roadscan.condition.tasks.lines import Roads
 from roadscan.core.errors import ConfigError, StoreError
 from roadscan.core.grid import Bounds, TileGrid, TileId
 from roadscan.core.survey import Survey
-from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import damaged_file, reason_of
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
@@ -34,9 +33,8 @@ from roadscan.store.store import Store
 from roadscan.store.writer import parquet_bytes
 from roadscan.surface.reconstruction import SurfaceGrid
 from roadscan.surface.settings import SurfaceConfig
-from roadscan.tiles.cells import TileCells
+from roadscan.tiles.cells import TileCells, read_cells
 from roadscan.tiles.product import ProductContext
-from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tiles import TaskResult
 
 

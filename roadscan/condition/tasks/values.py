@@ -44,9 +44,8 @@ from roadscan.condition.tasks.stretches import (
     unit_of,
 )
 from roadscan.core.witness import Finding
-from roadscan.run.code_reach import code_digest, name_of
 from roadscan.run.engine.compute import damaged_file, reason_of
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of, name_of
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded, recorded_table
 from roadscan.store.schema import table_schema

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from roadscan.compute.kernel_options import inner, kernel
-from roadscan.tiles.kernels.selection import sort_few
+from roadscan.compute.kernels.arrays import sort_few
 
 HALF_ALONG = 10
 """The window reaches this many cells to either side, in rows and in columns."""

@@ -29,7 +29,7 @@ from roadscan.formats.lidars.packet_returns import returns_batch
 from roadscan.ingest.reading.column_table import unlisted_batches, unlisted_reason
 from roadscan.ingest.reading.format import NO_LEVER_ARM, Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import Sieve
-from roadscan.store.damage import UNREADABLE
+from roadscan.store.digest import UNREADABLE
 from roadscan.store.readings.packed_returns import EIGHT_TO_SIXTEEN_BITS
 
 _COLUMNS: Final = ("x", "y", "z", "intensity", "laser_number", "offset_ns")

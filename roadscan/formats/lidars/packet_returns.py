@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Bool, Int32, Int64
 from roadscan.core.errors import Missing, TimeSystemError
 from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, Clock, TimeSystem, ahead_of_utc_s
 from roadscan.core.witness import Witness
@@ -84,10 +85,7 @@ def dated_clock(source: LogSource, stamp_s: float, ahead_s: float) -> Clock:
     )
 
 
-Bool: TypeAlias = npt.NDArray[np.bool_]
 Azimuths: TypeAlias = npt.NDArray[np.uint16]
-Int32: TypeAlias = npt.NDArray[np.int32]
-Int64: TypeAlias = npt.NDArray[np.int64]
 Gap: TypeAlias = tuple[int, int]
 """Last azimuth before it and first one after it (0.01°)."""
 

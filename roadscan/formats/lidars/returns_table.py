@@ -37,7 +37,7 @@ from roadscan.ingest.reading.columns import Found
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import EpochReader, Sieve
 from roadscan.ingest.reading.stamps import EPOCH, TableStamps, column_stamps, need_type
-from roadscan.store.damage import UNREADABLE
+from roadscan.store.digest import UNREADABLE
 
 AXES: Final = ("x_sensor_m", "y_sensor_m", "z_sensor_m")
 

@@ -31,15 +31,11 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.compute.array_types import Bool, Float32, Float64, Int32, Int64
 from roadscan.core.errors import ConfigError
 from roadscan.formats.lidars.packet_returns import TURN, Gap, jumps, returns_batch, steps
 from roadscan.store.readings.packed_returns import EIGHT_TO_SIXTEEN_BITS
 
-Bool: TypeAlias = npt.NDArray[np.bool_]
-Float32: TypeAlias = npt.NDArray[np.float32]
-Float64: TypeAlias = npt.NDArray[np.float64]
-Int32: TypeAlias = npt.NDArray[np.int32]
-Int64: TypeAlias = npt.NDArray[np.int64]
 Raw: TypeAlias = npt.NDArray[np.void]
 
 DIFOP_ID: Final = bytes.fromhex("a5ff005a11115555")

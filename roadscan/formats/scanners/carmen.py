@@ -53,7 +53,7 @@ from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.crs import LOCAL_WORLD
 from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.core.gpstime import Clock, TimeSystem
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import ScanGeometry
 from roadscan.core.strict import Strict, pattern_in_words
 from roadscan.ingest.reading.format import (
     NO_LEVER_ARM,

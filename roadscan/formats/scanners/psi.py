@@ -38,7 +38,7 @@ from pydantic import Field
 from roadscan.compute.array_types import Int64, UInt8, UInt16
 from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.core.gpstime import NS_PER_S, Clock, TimeSystem
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import ScanGeometry
 from roadscan.core.strict import Strict
 from roadscan.core.toml_text import toml
 from roadscan.formats.scanners.psi_container import PsiFile, PsiSection, is_psi

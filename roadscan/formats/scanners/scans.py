@@ -14,7 +14,7 @@ or ``time`` (integer or float)            or the stamp in the clock that the sur
 ========================================  ==============================================================
 
 Other columns are ignored. Lists may be fixed-size or not. The geometry of the readings
-(:class:`roadscan.core.scan_geometry.ScanGeometry`) stands as JSON in the file's schema metadata under
+(:class:`roadscan.core.rig.ScanGeometry`) stands as JSON in the file's schema metadata under
 ``roadscan.scan_geometry``, or in the log's options.
 
 A capture program that has to keep up with a line-rate head writes Arrow IPC without compression, lists of fixed
@@ -41,14 +41,14 @@ import pyarrow.compute as pc
 from roadscan.compute.array_types import Float64
 from roadscan.core.errors import ConfigError, FormatError, Missing, brief
 from roadscan.core.gpstime import Clock, TimeSystem
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import ScanGeometry
 from roadscan.core.strict import Strict
 from roadscan.ingest.array_files import ClockLike, WrittenLog, epochs_gps_ns, float_array, parquet_file, whole_array
 from roadscan.ingest.reading.column_table import Lost, open_table, schema_or_none, table_files
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
 from roadscan.ingest.reading.stamps import EPOCH, column_stamps, refuse_clock
-from roadscan.store.damage import UNREADABLE
+from roadscan.store.digest import UNREADABLE
 
 GEOMETRY_KEY: Final = "roadscan.scan_geometry"
 """Key of the schema metadata with the geometry as JSON."""

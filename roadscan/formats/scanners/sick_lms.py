@@ -47,7 +47,7 @@ from pydantic import Field
 from roadscan.compute.array_types import Bool, Int64, UInt8, UInt16
 from roadscan.core.errors import ConfigError, FormatError, Missing, nearest
 from roadscan.core.gpstime import NS_PER_S, UNIT_NS, Clock, TimeSystem
-from roadscan.core.scan_geometry import ScanGeometry
+from roadscan.core.rig import ScanGeometry
 from roadscan.core.strict import Strict
 from roadscan.formats.scanners.sick_telegrams import (
     ACKNOWLEDGES,

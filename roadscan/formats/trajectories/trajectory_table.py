@@ -32,7 +32,7 @@ from roadscan.ingest.reading.poses import (
 from roadscan.ingest.reading.records import Sieve, options_of
 from roadscan.ingest.reading.stamps import EPOCH, TIME, StampColumn, TableStamps, need_type
 from roadscan.ingest.reading.text_table import Kind, TextLayout, TextOptions, sniff_layout, text_blocks, text_layout
-from roadscan.store.damage import UNREADABLE
+from roadscan.store.digest import UNREADABLE
 
 GEODETIC: Final = (
     Quantity("longitude", "angle", ("lon", "lng")),

@@ -8,7 +8,7 @@ A line feature is a road; its vertices are brought into the survey's map. The wi
 
 and unknown otherwise. TIGER/Line itself holds neither widths nor lanes: "the attribute data holds the type of the
 road which would provide a fair idea about the width of the road" (Sairam, Nagarajan, Ornitz 2016, 3.3.1, whose filter
-keeps a buffer about that width; see ``roadscan.georeference.plan.centre_line``).
+keeps a buffer about that width; see ``roadscan.georeference.plan.road``).
 """
 
 from __future__ import annotations

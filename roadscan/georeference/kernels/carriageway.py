@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from roadscan.compute.kernel_options import inlined, inner, kernel
-from roadscan.compute.kernels.copies import copy_values
+from roadscan.compute.kernels.arrays import copy_values
 from roadscan.georeference.kernels.readings import CLASS_KEPT
 
 CLASS_SCATTERED, CLASS_OFF_ROAD = 10, 12

@@ -21,8 +21,7 @@ from roadscan.core.grid import LanePass, RunId, TileGrid, of_run
 from roadscan.core.rig import UNMOUNTED, Mounting, Mountings, Rig, Sensor
 from roadscan.core.survey import Survey
 from roadscan.georeference.place import HeightLimits
-from roadscan.georeference.plan.centre_line import CentreLines
-from roadscan.georeference.plan.road import check_road, road_of
+from roadscan.georeference.plan.road import CentreLines, check_road, road_of
 from roadscan.georeference.road_profiles import TICK_NS, WINDOW_NS
 from roadscan.georeference.sources import (
     MapSettings,
@@ -43,8 +42,7 @@ from roadscan.navigation.tasks.navigate import records_of, records_with_trajecto
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_all_corrections
 from roadscan.poses.movement import Allowance, allowance_for, largest
 from roadscan.poses.trajectory import STENCIL_KNOTS, Corrections
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import grid_key, key_of
+from roadscan.run.keys import code_digest, grid_key, key_of
 from roadscan.run.session import Session, found_once
 from roadscan.store.logs import NAVIGATION, DataFile, LogRecord
 from roadscan.store.store import Store

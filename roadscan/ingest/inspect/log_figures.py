@@ -24,7 +24,7 @@ from roadscan.core.witness import Finding
 from roadscan.ingest.reading.format import Item, LogHeader, Reject, Rows
 from roadscan.ingest.reading.stamps import FutureTimes
 from roadscan.poses.leaps import FASTEST_M_PER_S
-from roadscan.store.readings.returns import distances_m
+from roadscan.store.readings.row_groups import distances_m
 from roadscan.store.schema import TableSchema, table_schema
 
 LEAP_SPEED_M_PER_S: Final = FASTEST_M_PER_S

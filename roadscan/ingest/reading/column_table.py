@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 
 from roadscan.core.errors import FormatError, brief
 from roadscan.store.codecs.parquet.foreign_pages import ParquetPages
-from roadscan.store.damage import UNREADABLE
+from roadscan.store.digest import UNREADABLE
 
 _SUFFIXES: Final = (".parquet", ".arrow", ".feather", ".ipc")
 _MAPPED_CHUNKS: Final = 8

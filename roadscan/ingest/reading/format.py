@@ -298,7 +298,7 @@ class LogHeader:
     """JSON values that readings need to be understood.
 
     ``world_frame`` (trajectory): world frame of the poses.
-    ``scan_geometry`` (scans): fields of :class:`roadscan.core.scan_geometry.ScanGeometry`.
+    ``scan_geometry`` (scans): fields of :class:`roadscan.core.rig.ScanGeometry`.
     ``frame`` (returns): ``"sensor"``, or ``"body"`` where the maker already applied the mounting.
     ``mounting`` (scans, returns): what the log says of its sensor's mounting, by keys of
     :class:`roadscan.core.rig.Sensor` (`axes`, `lever_arm_body_m`, `boresight`); it holds where the rig states none.

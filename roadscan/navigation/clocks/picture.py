@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.core.canvas import empty_figure
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
@@ -16,7 +15,6 @@ from roadscan.ingest.clock_correction import ClockCorrection, Residuals
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Float64 = npt.NDArray[np.float64]
 
 _UNITS: Final = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"), (1e-9, "ns"))  # Factor and name of each unit of time.
 _BLUE, _GREY, _BAND = "#1f5fa8", "#9a9a9a", "#cfe0f2"

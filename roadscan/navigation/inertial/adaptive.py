@@ -32,7 +32,7 @@ from typing import Final
 import numpy as np
 
 from roadscan.compute.array_types import Bool, Float64, Int64
-from roadscan.compute.robust import scatter_about
+from roadscan.compute.arrays import scatter_about
 from roadscan.core.errors import NavigationError
 from roadscan.core.frames import rotation_from_quaternion
 from roadscan.core.settings.navigation import SmootherConfig

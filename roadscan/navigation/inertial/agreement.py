@@ -12,7 +12,7 @@ from typing import Final, NoReturn
 import numpy as np
 
 from roadscan.compute.array_types import Bool, Float64
-from roadscan.compute.flags import runs_of
+from roadscan.compute.arrays import runs_of
 from roadscan.core.errors import ConfigError, NavigationError, TimeSystemError
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.rig import STANDARD_GRAVITY_M_PER_S2

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from roadscan.compute.array_types import Bool, Float64, Int64
-from roadscan.compute.flags import runs_of
+from roadscan.compute.arrays import runs_of
 from roadscan.core.errors import NavigationError, TimeSystemError
 from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, WEEK_S, iso_from_gps_ns
 from roadscan.navigation.inertial.agreement import (

@@ -42,8 +42,7 @@ from roadscan.navigation.tasks.clock_tables import (
 from roadscan.navigation.tasks.navigation_logs import imu_readings, odometer_readings
 from roadscan.navigation.tasks.recorded_pictures import CLOCK_PICTURE, keep_file, picture_key, remove_others
 from roadscan.poses.trajectory import Trajectory
-from roadscan.run.code_reach import code_digest, name_of
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of, name_of
 from roadscan.store.logs import NAVIGATION, LogRecord, read_log_records
 from roadscan.store.manifest import Manifest
 from roadscan.store.readings.row_groups import read_groups

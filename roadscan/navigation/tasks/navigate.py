@@ -27,8 +27,7 @@ from roadscan.navigation.tasks.solve_trajectory import (
     trajectory_rows,
 )
 from roadscan.poses.trajectory import Trajectory
-from roadscan.run.code_reach import code_digest, name_of
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of, name_of
 from roadscan.run.session import Session, found_once
 from roadscan.store.logs import NAVIGATION, LogRecord, has_log, read_log_records, retire_log, write_log_record
 from roadscan.store.readings.row_groups import read_groups

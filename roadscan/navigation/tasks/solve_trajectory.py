@@ -33,8 +33,7 @@ from roadscan.navigation.tasks.navigation_logs import (
     odometer_readings,
     vehicle_sensors,
 )
-from roadscan.run.code_reach import code_digest, name_of
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of, name_of
 from roadscan.store.logs import NAVIGATION, LogRecord
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store

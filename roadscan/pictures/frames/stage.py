@@ -20,10 +20,9 @@ from roadscan.georeference.plan.plan import (
 )
 from roadscan.navigation.tasks.navigate import records_of
 from roadscan.navigation.tasks.recorded_pictures import TakenPictures
-from roadscan.pictures.frames.chosen import FOLDER, FRAMES, FrameTask, camera_pictures, write_frame
-from roadscan.run.code_reach import code_digest
+from roadscan.pictures.exposures import FOLDER, FRAMES, FrameTask, camera_pictures, write_frame
 from roadscan.run.engine.bundles import run_bundles
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState
 from roadscan.store.logs import LogRecord
@@ -126,7 +125,7 @@ def no_folder_of_frames() -> ConfigError:
 
 def _of_video(plan: SurveyPlan, taken: TakenPictures) -> list[FrameTask]:
     """Returns a task for each key frame of a video."""
-    record, code = taken.record, code_digest("roadscan.pictures.frames.chosen:write_frame")
+    record, code = taken.record, code_digest("roadscan.pictures.exposures:write_frame")
     path = plan.survey.resolve(Path(record.path))
     off_s = max(_OFF / float(record.attributes["fps"]), _LEAST_OFF_S)
     tasks = []

@@ -19,7 +19,7 @@ import pyarrow as pa
 
 from roadscan.compute.array_types import Float32, Float64
 from roadscan.core.extras import cv2
-from roadscan.pictures.frames.chosen import read_picture
+from roadscan.pictures.exposures import read_picture
 from roadscan.pictures.placed import Pictures
 from roadscan.pictures.settings import PictureTargetsConfig
 from roadscan.pictures.targets.candidates import Aim, Candidate, Eye, Pose, Shape, TargetPoint, across, aims, candidates

@@ -18,13 +18,12 @@ import pyarrow as pa
 
 from roadscan.compute.array_types import Float32, Float64, Int64
 from roadscan.core.extras import cv2
-from roadscan.pictures.frames.chosen import read_picture
+from roadscan.pictures.exposures import read_picture
 from roadscan.pictures.kernels.patch_matching import match_patches
 from roadscan.pictures.lens import derivatives, rays_of
 from roadscan.pictures.ties.tracks import CHAINS, TRACKS, Chains, chains_of, places_of, rows_of
 from roadscan.pictures.ties.work import ALL, FEATURES, TieWork, written
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store

@@ -13,8 +13,7 @@ import pyarrow as pa
 from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.pictures.lens import rays_of
 from roadscan.pictures.ties.work import ALL, FEATURES, MATCHES, MatchTask, TieWork, load_features, odd_pictures, written
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store

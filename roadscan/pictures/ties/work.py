@@ -15,16 +15,14 @@ from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
 from roadscan.navigation.tasks.trajectories import usual_pose_sigma
-from roadscan.pictures.exposures import Camera, Exposures, exposures_of
-from roadscan.pictures.frames.chosen import read_picture
+from roadscan.pictures.exposures import Camera, Exposures, exposures_of, read_picture
 from roadscan.pictures.lens import rays_of
 from roadscan.pictures.settings import PictureTiesConfig
 from roadscan.pictures.ties.matching import DESCRIPTOR, Features, Relative, features_of, matches, pairs_of
 from roadscan.pictures.ties.own_vehicle import OWN_VEHICLE, cells_from, cells_of, compare, compared_pictures, detail_of
 from roadscan.pictures.ties.own_vehicle import rows_of as rows_of_cells
 from roadscan.pictures.views import Lens
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.store.codecs.image_files import ImageError
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table

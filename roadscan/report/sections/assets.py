@@ -27,6 +27,7 @@ from roadscan.assets.tasks.evidence import CLASSIFIED
 from roadscan.assets.tasks.picture_work import CUT_OUTS
 from roadscan.assets.tasks.plan import asset_grid
 from roadscan.assets.tasks.tables import TABLES, read_layer
+from roadscan.compute.array_types import Float64
 from roadscan.core.extras import is_installed
 from roadscan.georeference.plan.plan import plan_of
 from roadscan.privacy.settings import publishes_as_they_are
@@ -118,8 +119,6 @@ class Thumbnails:
 _CROSS: Final = 3.0  # half the stroke of a cross, in units of the drawing
 _MOST_LINES: Final = 6000  # lines of the map
 _SEEN: Final = "some of the most probable ones, in pictures or as returns in the colours of their classes"
-
-Float64 = npt.NDArray[np.float64]
 
 
 class Assets(Section):

@@ -9,8 +9,8 @@ from itertools import cycle
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
+from roadscan.compute.array_types import Float64
 from roadscan.core.gpstime import NS_PER_S, utc_from_gps_ns
 from roadscan.core.grid import TileId
 from roadscan.georeference.plan.plan import NothingToPlaceError, plan_of
@@ -18,7 +18,7 @@ from roadscan.report.blocks import COLOURS, WIDTH, Block, Drawing, Line, MapPage
 from roadscan.report.section import Material, Section
 from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import OutputRecord
-from roadscan.tiles.drives import Drives
+from roadscan.tiles.lane_direction import Drives
 from roadscan.tiles.tasks.tile_plan import TILE
 
 
@@ -69,8 +69,6 @@ _ONE_PASS: Final = "#cfd6dd"
 _OVERLAPPED: Final = "#9fb4c7"
 _MOST_SQUARES: Final = 4000  # squares of the map: tiles are merged until there are no more
 _MOST_POINTS: Final = 1500  # points of a path on the map
-
-Float64 = npt.NDArray[np.float64]
 
 
 class Coverage(Section):

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 from PIL import Image
 
 from roadscan.adjust.tasks.outcome import PICTURES as ADJUSTMENT_PICTURES
+from roadscan.compute.array_types import UInt8
 from roadscan.condition.tasks.pictures import PICTURES as CONDITION_PICTURES
 from roadscan.condition.tasks.ravelling import RAVELLING_PICTURES
 from roadscan.condition.tasks.roughness_regions import REGION_PICTURES
@@ -32,8 +32,6 @@ _MOST_BYTES: Final = 512_000_000
 _MOST_OF_A_PRODUCT: Final = 4  # small pictures of a product
 _SHOWN_ELSEWHERE: Final = (ADJUSTMENT_PICTURES, CONDITION_PICTURES, RAVELLING_PICTURES, REGION_PICTURES)
 _SUFFIXES: Final = (".tif", ".png", ".jpg")
-
-UInt8 = npt.NDArray[np.uint8]
 
 
 class Made(Section):

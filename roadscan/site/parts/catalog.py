@@ -19,8 +19,7 @@ import shapely
 from roadscan.core.crs import MapFrame, crs_from_text
 from roadscan.core.gpstime import utc_from_gps_ns
 from roadscan.core.grid import TileId
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.site.document import Ask, Document, SitePart, json_document
 from roadscan.site.material import Material
 from roadscan.site.parts.clouds import cloud_box_m, cloud_sheets, cloud_url

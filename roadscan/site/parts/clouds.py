@@ -15,16 +15,14 @@ from roadscan.core.grid import TileId
 from roadscan.footprints.footprints import footprints_of
 from roadscan.georeference.cloud import TilePoints
 from roadscan.georeference.plan.plan import plan_of
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.site.cloud_file import PointSpool, write_cloud
 from roadscan.site.document import Ask, Document, SitePart, json_document
 from roadscan.site.layer import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY
 from roadscan.site.layers.passes import RUN_COLOURS
 from roadscan.site.material import Material
-from roadscan.tiles.blocks import cut_blocks
-from roadscan.tiles.products.cloud_records import Lattice
-from roadscan.tiles.tasks.tile_plan import TilePlan, tiles_of
+from roadscan.tiles.products.las import Lattice
+from roadscan.tiles.tasks.tile_plan import TilePlan, cut_blocks, tiles_of
 from roadscan.tiles.tasks.tile_points import load_points
 
 _CODE: Final = ("roadscan.site.cloud_file:write_cloud", "roadscan.tiles.tasks.tile_points:load_points")

@@ -21,8 +21,7 @@ from roadscan.pictures.placed import Pictures as PlacedPictures
 from roadscan.pictures.views import HEIGHT, WIDTH
 from roadscan.privacy.detector import KINDS
 from roadscan.privacy.hider import Hider, decoded, encoded
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.site.document import Ask, Document, SitePart, json_bytes, json_document
 from roadscan.site.material import Material, sheet_name
 from roadscan.site.parts.catalog import STAC, is_placed, projection_of, to_longitude_latitude

@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from roadscan.core.strict import Strict
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.site.document import Ask, Document, SitePart, json_bytes
 from roadscan.site.material import Material
 from roadscan.site.site_rasters import (

@@ -14,9 +14,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import shapely
 
+from roadscan.compute.array_types import Float64
 from roadscan.condition.index import condition_indices
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.site.document import Ask, Document, SitePart, json_bytes
 from roadscan.site.layer import title_of
 from roadscan.site.material import Material
@@ -36,8 +36,6 @@ _BEYOND_M: Final = 1.0
 """Margin of the last piece beyond the lane's end, where a section may end."""
 _PARTS: Final = 4
 """Pieces of a longer lane's values for each file of the table, which covers about a kilometre."""
-
-Float64 = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

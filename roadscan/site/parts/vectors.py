@@ -15,8 +15,7 @@ import shapely
 
 from roadscan.assets.files.layers import Layer, write_flatgeobuf
 from roadscan.core.errors import RoadscanError
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.site.document import Ask, Document, SitePart, json_document
 from roadscan.site.layer import SiteLayer, layer_kinds
 from roadscan.site.material import Material, box_of, sheet_name

@@ -25,7 +25,7 @@ import pyarrow as pa
 
 from roadscan.core.crs import MapFrame
 from roadscan.store.codecs import SOFTWARE
-from roadscan.store.codecs.kernels.raster_blocks import cut_lines, encode_block, encode_cells, round_values
+from roadscan.store.codecs.kernels.byte_planes import cut_lines, encode_block, encode_cells, round_values
 from roadscan.store.codecs.tiff import Page, Tag, digest_item, raster_crs, raster_settings, tiff_parts
 from roadscan.store.codecs.zlib_stream import compressed
 

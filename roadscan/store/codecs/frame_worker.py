@@ -1,4 +1,4 @@
-"""Decodes frames of a video for `pictures/frames/chosen.py`: damaged bytes can crash or stall the libraries for that.
+"""Decodes frames of a video for `pictures/exposures.py`: damaged bytes can crash or stall the libraries for that.
 
 A request is the time of a frame since the first packet and how far it may be off (two float64, ms). The reply: height
 and width (int32) and the pixels, blue first. Frames that are asked for in order are decoded once.

@@ -6,16 +6,31 @@ from it (isal 1.9.1). The kernel finds runs and no other repetitions: measured r
 
 from __future__ import annotations
 
+import os
 import threading
 import zlib
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 from isal import isal_zlib
 
-from roadscan.store.codecs.choice import LIBRARY
 from roadscan.store.codecs.kernels.deflate import PAIRS, SEGMENT, deflate, room_words
+
+_VARIABLE: Final = "ROADSCAN_CODECS"
+_CHOICES: Final = ("own", "library")
+
+
+def _chosen() -> str:
+    stated = os.environ.get(_VARIABLE, "") or "own"
+    if stated not in _CHOICES:
+        raise SystemExit(f"{_VARIABLE} is '{stated}'; it is one of: {', '.join(_CHOICES)}")
+    return stated
+
+
+LIBRARY: Final = _chosen() == "library"
+"""True if the environment has ``ROADSCAN_CODECS=library``: slower, with other bytes but the same content."""
+
 
 _LEVEL = 1  # zlib's fastest level
 _KEPT = threading.local()

@@ -22,9 +22,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.core.errors import StoreError
-from roadscan.store.codecs.choice import LIBRARY
 from roadscan.store.codecs.parquet.page_file import DamageError, PageFile, read_footer
-from roadscan.store.damage import ROWS_CHANGE, UNREADABLE, unread
+from roadscan.store.codecs.zlib_stream import LIBRARY
+from roadscan.store.digest import ROWS_CHANGE, UNREADABLE, unread
 from roadscan.store.store import Store
 
 
@@ -133,7 +133,7 @@ Pages = TypeVar("Pages", bound=PageFile)
 
 
 def opened_footer(store: Store, file: str) -> Footer:
-    """Open a file of the store and read its footer; raises what `store.damage.UNREADABLE` names."""
+    """Open a file of the store and read its footer; raises what `store.digest.UNREADABLE` names."""
     source = opened(store, file)
     return source, *read_footer(source.stream)
 

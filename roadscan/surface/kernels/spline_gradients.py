@@ -19,8 +19,7 @@ import math
 import numpy as np
 
 from roadscan.compute.kernel_options import bare, bare_inner, kernel
-from roadscan.compute.kernels.covariances import PEAK, REACH, covariances, slope_covariances
-from roadscan.compute.kernels.factorisation import LANES, TOGETHER, factorise
+from roadscan.compute.kernels.covariances import LANES, PEAK, REACH, TOGETHER, covariances, factorise, slope_covariances
 from roadscan.surface.kernels.delaunay import MOST, MOST_RINGS, grow, is_narrow, whitening
 
 TERMS, HEIGHTS, ALONG_U, ALONG_V, SIDES = 6, 6, 7, 8, 9

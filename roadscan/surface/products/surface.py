@@ -20,12 +20,14 @@ from roadscan.store.codecs.cog import Band, Pixels, dense_image, write_cog, writ
 from roadscan.store.codecs.tiff import check_cog
 from roadscan.surface.tile import EMPTY, GridWindow, SurfaceTile
 from roadscan.tiles.product import LoadCells, Output, ProductContext, SurfaceProduct, SurveyProduct, TileSummary
-from roadscan.tiles.products.raster import CellBox, about, height_unit
-from roadscan.tiles.products.sheets import (
+from roadscan.tiles.products.raster import (
+    CellBox,
     Sheet,
+    about,
     check_index,
     cut_sheets,
     dated,
+    height_unit,
     index_name,
     index_output,
     sheet_of,

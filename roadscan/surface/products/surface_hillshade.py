@@ -30,16 +30,18 @@ from roadscan.surface.products.surface import (
 from roadscan.surface.tile import EMPTY, SurfaceTile
 from roadscan.tiles.product import LoadCells, Output, ProductContext, SurfaceProduct, SurveyProduct, TileSummary
 from roadscan.tiles.products.hillshade import (
+    PNG_SIGNATURE,
     SHADE_BAND,
     HillshadeOptions,
+    MeanPixels,
     shade,
     with_empty_rim,
     with_neighbours,
+    write_picture,
 )
-from roadscan.tiles.products.raster import about
-from roadscan.tiles.products.relief_picture import PNG_SIGNATURE, MeanPixels, write_picture
-from roadscan.tiles.products.sheets import (
+from roadscan.tiles.products.raster import (
     Sheet,
+    about,
     cut_sheets,
     dated,
     index_name,

@@ -17,18 +17,15 @@ from roadscan.core.survey import Survey
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.pictures.colours import ColourSource
 from roadscan.pictures.placed import Pictures, check_folders, check_pictures, plan_pictures, rule_cameras
-from roadscan.run.code_reach import code_digest
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.store import Store
 from roadscan.surface.reconstruction import SurfaceGrid
 from roadscan.surface.settings import SurfaceConfig
 from roadscan.surface.tasks.found_regions import FoundRegions, Regions, stated_regions
 from roadscan.surface.tile import NodeColours, SurfaceTile
-from roadscan.tiles.blocks import Block, cut_blocks
-from roadscan.tiles.product import ProductContext, SurfaceProduct
-from roadscan.tiles.tasks.tile_files import WantedSurface, surface_file_names
-from roadscan.tiles.tasks.tile_plan import TILE, TilePlan, TileTask
+from roadscan.tiles.product import ProductContext, SurfaceProduct, WantedSurface, surface_file_names
+from roadscan.tiles.tasks.tile_plan import TILE, Block, TilePlan, TileTask, cut_blocks
 from roadscan.tiles.tasks.wanted_products import product_context, wanted_products, wanted_surface_products
 
 COLOURS: Final = "colours"

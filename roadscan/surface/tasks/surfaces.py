@@ -19,10 +19,8 @@ from roadscan.surface.reconstruction import Patch, SurfaceGrid, patch_of_cells, 
 from roadscan.surface.regions import FILLED, INTERPOLATED, MEASURED
 from roadscan.surface.tasks.surface_plan import SURFACE, Painter, SurfaceTask
 from roadscan.surface.tile import SurfaceTile
-from roadscan.tiles.cells import TileCells
-from roadscan.tiles.product import ProductContext
-from roadscan.tiles.tasks.cell_files import read_cells
-from roadscan.tiles.tasks.tile_files import publish_product
+from roadscan.tiles.cells import TileCells, read_cells
+from roadscan.tiles.product import ProductContext, publish_product
 from roadscan.tiles.tasks.tile_plan import TileTask
 from roadscan.tiles.tasks.tile_points import load_points
 from roadscan.tiles.tasks.tiles import TaskResult

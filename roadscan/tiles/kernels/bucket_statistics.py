@@ -14,7 +14,7 @@ from roadscan.compute.kernel_options import bare, bare_inlined, bare_inner, inli
 from roadscan.compute.kernels.column_statistics import LANES, statistics_of, statistics_of_64
 from roadscan.georeference.kernels.timed_readings import CHUNK, place_mirror, place_returns, places
 from roadscan.tiles.kernels.accumulate import end_of_pass, find_cells
-from roadscan.tiles.kernels.cell_columns import select_arrays, statistics_of_full, write_statistics
+from roadscan.tiles.kernels.cell_statistics import select_arrays, statistics_of_full, write_statistics
 from roadscan.tiles.kernels.row_buckets import (
     BLOCK,
     COLUMN,

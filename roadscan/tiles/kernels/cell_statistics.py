@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.kernel_options import bare, bare_inlined, bare_inner, kernel
-from roadscan.compute.kernels.column_statistics import statistics_of_64
-from roadscan.compute.kernels.height_slots import (
+from roadscan.compute.kernels.arrays import BINS, bounds_of, smallest
+from roadscan.compute.kernels.column_statistics import LANES, REACH, statistics_of_64, store_group
+from roadscan.compute.kernels.slots import (
     COUNTS,
-    LANES,
     LIGHT_SHIFT,
     LIGHTS,
     MARK_SHIFT,
@@ -20,14 +21,111 @@ from roadscan.compute.kernels.height_slots import (
     SLOT_SIZE,
     WORD_SHIFT,
     WORDS,
+    chained_cells,
+    open_group,
     prefetch,
+    put_apart,
+    slot_statistics_of_8,
+    slot_statistics_of_28,
 )
-from roadscan.compute.kernels.slot_groups import chained_cells, open_group, put_apart
-from roadscan.compute.kernels.slot_statistics import slot_statistics_of_8, slot_statistics_of_28
-from roadscan.compute.kernels.store_statistics import store_group
-from roadscan.compute.kernels.streak_slots import lowest_bit
-from roadscan.tiles.kernels.cell_columns import select_arrays, statistics_of_full, write_statistics
-from roadscan.tiles.kernels.pool import header_of, release
+from roadscan.compute.kernels.streaks import lowest_bit
+from roadscan.tiles.kernels.accumulate import header_of, release
+
+
+class CellColumns(NamedTuple):
+    """Columns for c cells with a reading, in order of row and column, of up to p passes each."""
+
+    column: npt.NDArray[np.uint16]
+    """(c,) in the tile."""
+    row: npt.NDArray[np.uint16]
+    """(c,)"""
+    readings: npt.NDArray[np.uint32]
+    """(c,)"""
+    height_mean_m: npt.NDArray[np.float64]
+    """(c,)"""
+    height_robust_m: npt.NDArray[np.float64]
+    """(c,) mean of the heights near the median."""
+    height_min_m: npt.NDArray[np.float64]
+    """(c,)"""
+    height_max_m: npt.NDArray[np.float64]
+    """(c,)"""
+    height_std_m: npt.NDArray[np.float32]
+    """(c,)"""
+    intensity_mean: npt.NDArray[np.float32]
+    """(c,)"""
+    pass_offsets: npt.NDArray[np.int32]
+    """(c + 1,) first pass of each cell, and the end."""
+    pass_ids: npt.NDArray[np.uint16]
+    """(c · p,) ids of each cell's passes, ascending."""
+
+
+@bare_inlined
+def write_statistics(out, lane, cell, columns):
+    """Write a lane of `out`, see ``column_statistics.statistics_of``, as the statistics of a cell."""
+    columns.height_mean_m[cell], columns.height_robust_m[cell] = out[0, lane], out[1, lane]
+    columns.height_min_m[cell], columns.height_max_m[cell] = out[2, lane], out[3, lane]
+    columns.height_std_m[cell], columns.intensity_mean[cell] = np.float32(out[4, lane]), np.float32(out[5, lane])
+
+
+_MEAN, _ROBUST, _LOW, _HIGH, _DEVIATION, _BRIGHT = range(6)  # Rows of the statistics.
+
+
+def select_arrays(most: int) -> tuple[Any, ...]:
+    """Return the working arrays of `statistics_of_full`; `most`: heights that a cell may have."""
+    return np.empty(most, np.int32), np.empty(BINS, np.int32), np.empty(most + 1, np.int32)
+
+
+@bare
+def differences(heights, base, out):
+    """Write heights (n,) int32 relative to a base into out (≥ n,) int32."""
+    for k in range(heights.size):
+        out[k] = heights[k] - base
+
+
+@bare
+def distances(heights, middle, out):
+    """Write distances of heights (n,) int32 from another into out (≥ n,) int32."""
+    for k in range(heights.size):
+        out[k] = abs(heights[k] - middle)
+
+
+@bare_inner
+def sums_of(heights, middle, reach):
+    """Return sum and sum of squares of (n,) int32 less a middle, number within reach, and their sum."""
+    total, squares, used, near = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
+    for k in range(heights.size):
+        d = np.int64(heights[k]) - middle
+        inside = np.int64((d <= reach) & (d >= -reach))
+        total += d
+        squares += d * d
+        used += inside
+        near += d * inside
+    return total, squares, used, near
+
+
+@bare
+def statistics_of_full(heights, light, floor, quantum_m, select, out, lane):
+    """Write the statistics of one cell of n readings, as ``column_statistics.statistics_of``, into out[:, lane].
+
+    heights : (n,) int32; light : int64, sum of intensities; select : work, see :func:`select_arrays`.
+    """
+    work, bins, found = select
+    n, base = heights.size, heights[0]
+    differences(heights, base, work)
+    median = smallest(work[:n], (n - 1) // 2, bins, found)
+    middle = np.int64(base) + median
+    distances(heights, np.int32(middle), work)
+    low, high = bounds_of(heights)
+    reach = np.int64(math.floor(max(REACH * smallest(work[:n], (n - 1) // 2, bins, found), floor)))
+    total, squares, used, near = sums_of(heights, middle, reach)
+    average = total / n
+    out[_MEAN, lane] = (middle + average) * quantum_m
+    out[_ROBUST, lane] = (middle + near / used) * quantum_m
+    out[_LOW, lane] = low * quantum_m
+    out[_HIGH, lane] = high * quantum_m
+    out[_DEVIATION, lane] = math.sqrt(max(squares / n - average * average, 0.0)) * quantum_m
+    out[_BRIGHT, lane] = light / n
+
 
 AHEAD = 2
 """Number of groups whose slots are prefetched."""

@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.kernel_options import bare_inlined, bare_inner, kernel
+from roadscan.compute.kernels.arrays import copy_values
 from roadscan.compute.kernels.column_statistics import LANES, MAD_TO_SIGMA, OUTLIER_SIGMAS, medians_of_16
-from roadscan.compute.kernels.copies import copy_values
-from roadscan.tiles.kernels.adjacent_cells import run_end
+from roadscan.tiles.kernels.pyramid import run_end
 
 ABSENT = np.int32(2**31 - 1)
 """Height of a position without a cell."""

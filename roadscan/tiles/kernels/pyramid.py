@@ -8,7 +8,29 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.kernel_options import bare, bare_inner, kernel
-from roadscan.tiles.kernels.adjacent_cells import run_end
+
+
+@bare
+def run_end(column, row, start, end):
+    """Return the end of the run that begins at `start`: cells of one row, each beside the one before.
+
+    Parameters
+    ----------
+    column, row : (n,) uint16, sorted by row, column, no cell twice.
+    start, end : int, the run ends at `end` at the latest.
+    """
+    step = 1
+    while start + step < end and row[start + step] == row[start] and column[start + step] - column[start] == step:
+        step *= 2
+    low, high = start + (step >> 1), min(start + step, end)
+    while high - low > 1:
+        middle = (low + high) >> 1
+        if row[middle] == row[start] and column[middle] - column[start] == middle - start:
+            low = middle
+        else:
+            high = middle
+    return low + 1
+
 
 TO_HEIGHT_UNIT = 1.5 * 2.0**20
 """Adding and subtracting it rounds a number below 2¹⁹ to a multiple of 2⁻³² (heights, m: 0.23 nm)."""

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.kernel_options import bare, bare_inlined, bare_inner
-from roadscan.compute.kernels.height_slots import prefetch
+from roadscan.compute.kernels.slots import prefetch
 from roadscan.georeference.kernels.readings import CLASS_KEPT, KEPT, OUTSIDE
 
 BLOCK = 64

@@ -11,13 +11,12 @@ from roadscan.core.strict import Strict
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.run.engine.bundles import run_bundles
 from roadscan.run.engine.compute import Compute
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import key_of
 from roadscan.store.digest import file_digest
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.store import Store
-from roadscan.tiles.cells import CellValues, TileCells
-from roadscan.tiles.drives import Drives
-from roadscan.tiles.lane_direction import LaneDirections
+from roadscan.tiles.cells import CellValues, Level, TileCells, pyramid_of, read_cells, read_overview, read_values
+from roadscan.tiles.lane_direction import Drives, LaneDirections
 from roadscan.tiles.product import (
     Output,
     ProductContext,
@@ -25,8 +24,6 @@ from roadscan.tiles.product import (
     TileSummary,
     products,
 )
-from roadscan.tiles.pyramid import Level, pyramid_of
-from roadscan.tiles.tasks.cell_files import read_cells, read_overview, read_values
 from roadscan.tiles.tasks.tile_figures import tile_figures
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE
 from roadscan.tiles.tasks.wanted_products import product_context, product_key, wanted_products

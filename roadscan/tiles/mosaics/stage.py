@@ -25,10 +25,9 @@ from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState
 from roadscan.store.manifest import Manifest
 from roadscan.store.store import Store
-from roadscan.tiles.cells import TileCells
+from roadscan.tiles.cells import TileCells, read_cells
 from roadscan.tiles.mosaics.products import make_products, wanted_outputs
 from roadscan.tiles.product import SurfaceProduct, SurveyProduct, products
-from roadscan.tiles.tasks.cell_files import read_cells
 from roadscan.tiles.tasks.tile_figures import Summaries, tile_figures
 from roadscan.tiles.tasks.tile_plan import TILE
 

@@ -14,9 +14,9 @@ from pydantic import Field
 from roadscan.core.strict import Strict
 from roadscan.store.codecs.cog import Image, sparse_image, write_cog
 from roadscan.store.codecs.tiff import check_cog
+from roadscan.tiles.cells import Level, pyramid_of
 from roadscan.tiles.product import ProductContext, Tile, TileProduct
 from roadscan.tiles.products.raster import CellBox, Quantity, about, band_of
-from roadscan.tiles.pyramid import Level, pyramid_of
 
 STEPS: Final[dict[Quantity, float]] = {
     "height": 2.0**-15,

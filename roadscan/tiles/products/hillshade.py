@@ -7,39 +7,100 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Final, Protocol, cast
+from typing import Any, ClassVar, Final, Protocol, Self, cast
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from roadscan.compute.array_types import Float64
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.grid import TileId
 from roadscan.core.strict import Strict
 from roadscan.store.codecs.cog import Band
 from roadscan.store.codecs.grey_picture import check_picture
-from roadscan.store.codecs.tiff import raster_settings
+from roadscan.store.codecs.tiff import raster_settings, without_place_warning
 from roadscan.tiles.kernels.grey_pictures import shade_raster
 from roadscan.tiles.product import Cells, LoadCells, Output, ProductContext, SurveyProduct, TileSummary
-from roadscan.tiles.products.raster import CellBox, SparseRaster, cell_image, paste_tile
-from roadscan.tiles.products.relief_picture import PNG_SIGNATURE, MeanPixels, write_picture
-from roadscan.tiles.products.sheets import (
+from roadscan.tiles.products.raster import (
+    CellBox,
     Sheet,
+    SparseRaster,
+    cell_image,
     check_sheet,
     cut_sheets,
     dated,
     index_name,
     index_output,
+    paste_tile,
     sheet_of,
     unknown_output,
     values_in,
     write_index,
 )
 
+PNG_SIGNATURE: Final = b"\x89PNG\r\n\x1a\n"
+
+_EMPTY: Final = 0  # Grey of a pixel without a height.
+
+
+@dataclass(frozen=True)
+class MeanPixels:
+    """Mean heights in pixels of several cells, north up."""
+
+    steps: tuple[int, int]
+    """Cells along the edges of a pixel: down, and to the right."""
+    total: Float64
+    """(rows, columns) sum of the heights (m)."""
+    count: Float64
+
+    @classmethod
+    def over(cls, rows: int, columns: int, steps: tuple[int, int]) -> Self:
+        """Create empty pixels over so many rows and columns of cells."""
+        shape = -(-rows // steps[0]), -(-columns // steps[1])
+        return cls(steps, np.zeros(shape), np.zeros(shape))
+
+    def add(self, row: Int64, column: Int64, heights_m: Float64) -> None:
+        """Add cells: row and column (n,) from the north-west, and their heights (n,)."""
+        down, right = self.steps
+        number = (row // down) * self.total.shape[1] + column // right
+        pixel, inverse = np.unique(number, return_inverse=True)
+        self.total.reshape(-1)[pixel] += np.bincount(inverse, weights=heights_m)
+        self.count.reshape(-1)[pixel] += np.bincount(inverse)
+
+    def trimmed(self) -> Float64:
+        """Return (rows, columns) mean heights, NaN where empty, without empty rows and columns at the edges."""
+        with np.errstate(invalid="ignore"):
+            heights_m = self.total / self.count
+        known = self.count > 0
+        rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+        return heights_m[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+
+
+def write_picture(path: Path, grey: npt.NDArray[np.uint8]) -> None:
+    """Write (rows, columns) of grey as a PNG in which 0 is transparent."""
+    from rasterio.shutil import copy as translate
+
+    opaque = np.where(grey == _EMPTY, 0, 255).astype(np.uint8)
+    with raster_settings(), without_place_warning(), _in_memory(grey, opaque) as picture:
+        translate(picture, str(path), driver="PNG", zlevel=6)
+
+
+@contextmanager
+def _in_memory(*bands: npt.NDArray[np.uint8]) -> Iterator[Any]:
+    import rasterio
+
+    rows, columns = bands[0].shape
+    with rasterio.open(
+        "picture", "w+", driver="MEM", width=columns, height=rows, count=len(bands), dtype="uint8"
+    ) as raster:
+        for number, band in enumerate(bands, start=1):
+            raster.write(band, number)
+        yield raster
+
+
 _STEM: Final = "hillshade"
 _PICTURE: Final = "hillshade.png"
 _HEIGHT: Final = "height_robust_m"  # Column of cells that is drawn.
-_EMPTY: Final = 0  # Grey of a pixel without a height.
 SHADE_BAND: Final = Band("hillshade", "")
 
 

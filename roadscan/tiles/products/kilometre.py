@@ -15,11 +15,14 @@ from roadscan.core.errors import StoreError
 from roadscan.core.grid import TileGrid, TileId
 from roadscan.core.strict import Strict
 from roadscan.store.codecs.cog import Band, write_sparse_cog
+from roadscan.tiles.cells import Level, overview_factors
 from roadscan.tiles.product import Cells, LoadCells, Output, ProductContext, SurveyProduct, TileSummary
 from roadscan.tiles.products.hillshade import SHADE_BAND, Light, base_below, shade, with_neighbours
-from roadscan.tiles.products.raster import CellBox, about, band_of
-from roadscan.tiles.products.sheets import (
+from roadscan.tiles.products.raster import (
+    CellBox,
     Sheet,
+    about,
+    band_of,
     check_sheet,
     cut_sheets,
     dated,
@@ -29,7 +32,6 @@ from roadscan.tiles.products.sheets import (
     unknown_output,
     write_index,
 )
-from roadscan.tiles.pyramid import Level, overview_factors
 
 View = Literal["height", "intensity", "shaded"]
 """Mean robust height, mean intensity, shaded relief of the heights."""

@@ -2,26 +2,81 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Final, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple, cast
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
 from roadscan.compute.array_types import Float64, Int64
+from roadscan.core.crs import MapFrame
 from roadscan.core.errors import ConfigError, StoreError
 from roadscan.core.gpstime import ADJUSTED_OFFSET_S, NS_PER_S
-from roadscan.core.grid import TileGrid
+from roadscan.core.grid import QUANTA_PER_M, TileGrid
 from roadscan.core.strict import Strict
 from roadscan.georeference.cloud import TilePoints
 from roadscan.store.codecs.las import ONE_OF_ONE, Layout, check_points, write_points
 from roadscan.tiles.product import Cells, ProductContext, Tile, TileProduct
-from roadscan.tiles.products.las_axes import Axes, axis, rounding_errors, set_coordinates
 
 if TYPE_CHECKING:
     import laspy
+
+
+_INT32_MAX: Final = 2**31 - 1  # Largest stored coordinate.
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One coordinate as LAS stores it: value = stored · scale + offset, in the CRS's unit."""
+
+    stored: npt.NDArray[np.int32]
+    scale: float
+    offset: float
+    error_max_m: float
+    """Largest difference between a point and what a reader gets back (m)."""
+
+
+Axes = tuple[Axis, Axis, Axis]
+
+
+def axis(quanta: npt.NDArray[Any], corner_quanta: int, scale_m: float, unit_m: float, product: str) -> Axis:
+    """Return an axis that stores `quanta` (n,) from `corner_quanta`; offsets are whole units, shared by all tiles.
+
+    Raises :class:`ConfigError` where the scale is too fine for 32 bits.
+    """
+    unit_quanta = QUANTA_PER_M * unit_m
+    scale = _scale(scale_m, unit_m)
+    offset = float(math.floor(corner_quanta / unit_quanta))
+    steps = np.rint((quanta + (corner_quanta - offset * unit_quanta)) / (unit_quanta * scale))
+    if steps.size and np.abs(steps).max() > _INT32_MAX:
+        raise ConfigError(f"{product}.scale_m = {scale_m:g} is too fine for these coordinates", change="make it larger")
+    true_m = (quanta.astype(np.float64) + corner_quanta) / QUANTA_PER_M
+    error_m = np.abs((steps * scale + offset) * unit_m - true_m)
+    return Axis(steps.astype(np.int32), scale, offset, float(error_m.max(initial=0.0)))
+
+
+def rounding_errors(axes: Axes) -> dict[str, float]:
+    """Return the largest rounding error of each coordinate (m), rounded to nanometres."""
+    return {name: round(one.error_max_m, 9) for name, one in zip("xyz", axes, strict=True)}
+
+
+def set_coordinates(record: Any, axes: Axes) -> None:
+    """Fill the three coordinates of a point record."""
+    for name, one in zip("XYZ", axes, strict=True):
+        record[name] = one.stored
+
+
+def _scale(scale_m: float, unit_m: float) -> float:
+    if unit_m == 1.0:
+        return scale_m
+    exponent = math.floor(math.log10(scale_m / unit_m))
+    leading = scale_m / unit_m / 10.0**exponent
+    step = max(digit for digit in (1, 2, 5) if digit <= leading or digit == 1)
+    return float(f"{step}e{exponent}")
 
 
 _SCAN_ANGLE_STEP_DEG: Final = 0.006  # Step of the scan angle in LAS 1.4.
@@ -267,3 +322,57 @@ def _facts(points: TilePoints, tile: Tile, axes: Axes, options: LasOptions, cont
     if tile.marked is not None and options.spacing_m is None:
         facts["marked_points"] = len(tile.marked)
     return facts
+
+
+SCALE_M: Final = 1e-4
+"""Step of the stored coordinates (m)."""
+PRODUCT: Final = "publish"
+
+_PLAIN, _COLOURED = 6, 7  # LAS point formats without and with colours.
+
+
+class Lattice(NamedTuple):
+    """Parameters that all records of a cloud share."""
+
+    map: MapFrame
+    grid: TileGrid
+    offsets: tuple[float, float, float]
+    """Origin of the stored coordinates, in whole units of the CRS."""
+
+
+def layout_of(frame: MapFrame, *, coloured: bool) -> Layout:
+    """Return the layout of the records: point format 6, or 7 with colours; no further dimensions."""
+    empty = np.zeros(0, np.int32)
+    units = (frame.horizontal_unit_m, frame.horizontal_unit_m, frame.vertical_unit_m)
+    scales = tuple(axis(empty, 0, SCALE_M, unit_m, PRODUCT).scale for unit_m in units)
+    return Layout(_COLOURED if coloured else _PLAIN, (), scales, frame, PRODUCT)
+
+
+def records_of(points: TilePoints, lattice: Lattice) -> npt.NDArray[np.void]:
+    """Return (n,) records of format 7 of a tile's points; without colours these are black."""
+    import laspy
+
+    size, frame = lattice.grid.size_quanta, lattice.map
+    units = (frame.horizontal_unit_m, frame.horizontal_unit_m, frame.vertical_unit_m)
+    corners = (points.tile.column * size, points.tile.row * size, 0)
+    quanta = (points.x_quanta, points.y_quanta, points.height_quanta)
+    axes = [axis(q, c, SCALE_M, u, PRODUCT) for q, c, u in zip(quanta, corners, units, strict=True)]
+    record: Any = laspy.ScaleAwarePointRecord.zeros(len(points), header=layout_of(frame, coloured=True).header)
+    set_coordinates(record, (axes[0], axes[1], axes[2]))
+    for name, one, offset in zip("XYZ", axes, lattice.offsets, strict=True):
+        record[name] += np.int32(round((one.offset - offset) / one.scale))
+    fill_record(record, points)
+    held: npt.NDArray[np.void] = record.array
+    return held
+
+
+def picked(records: npt.NDArray[np.void], numbers: npt.NDArray[np.integer[Any]]) -> npt.NDArray[np.void]:
+    """Return some records (n,) by number; as rows of bytes they are copied six times as fast as field by field."""
+    rows = np.ascontiguousarray(records).view(np.uint8).reshape(records.size, -1)
+    return np.take(rows, numbers, axis=0).view(records.dtype).ravel()
+
+
+def without_colours(records: npt.NDArray[np.void], plain: np.dtype[np.void]) -> npt.NDArray[np.void]:
+    """Return records of format 7 as format 6, which has the same first fields."""
+    kept = np.ascontiguousarray(records).view(np.uint8).reshape(records.size, -1)[:, : plain.itemsize]
+    return np.ascontiguousarray(kept).view(plain).ravel()

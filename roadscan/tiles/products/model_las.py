@@ -18,7 +18,7 @@ from roadscan.core.strict import Strict
 from roadscan.store.codecs.las import ONE_OF_ONE, Layout, check_points, write_points
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.product import Cells, ProductContext, Tile, TileProduct
-from roadscan.tiles.products.las_axes import Axes, axis, rounding_errors, set_coordinates
+from roadscan.tiles.products.las import Axes, axis, rounding_errors, set_coordinates
 
 _UNCLASSIFIED = 1  # ASPRS class.
 _WITHHELD = np.uint8(4)

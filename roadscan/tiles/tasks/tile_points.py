@@ -12,7 +12,7 @@ import numpy.typing as npt
 from roadscan.core.grid import QUANTUM_M, TileId
 from roadscan.georeference.cloud import TilePoints, canonical_order, fill_of
 from roadscan.georeference.place import EXTRA_COLUMNS, Placed, Window, passes_of
-from roadscan.georeference.plan.centre_line import CentreLineBuffer, load_buffer
+from roadscan.georeference.plan.road import CentreLineBuffer, load_buffer
 from roadscan.georeference.reading_counts import ReadingCounts
 from roadscan.georeference.road_profiles import KEPT, LAS_CLASSES, OFF_CENTRE_LINE, WITHHELD_FLAG
 from roadscan.georeference.sources import Georeferencer, MapSettings, RawSlice, ReadingSource

@@ -18,14 +18,10 @@ from roadscan.run.engine.compute import Compute, reason_of
 from roadscan.store.manifest import Manifest
 from roadscan.store.records import OutputRecord, Packed, Row, table_of
 from roadscan.store.store import told_if_full
-from roadscan.tiles.blocks import Block
-from roadscan.tiles.cells import TileCells, TileEvidence
-from roadscan.tiles.product import Tile
-from roadscan.tiles.tasks.cell_files import write_cells, write_overviews
-from roadscan.tiles.tasks.passes_apart import FIGURE as PASSES_APART
-from roadscan.tiles.tasks.passes_apart import apart_in_tile
-from roadscan.tiles.tasks.tile_files import publish_file, write_product
-from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, TileTask
+from roadscan.tiles.cells import TileCells, TileEvidence, write_cells, write_overviews
+from roadscan.tiles.product import Tile, publish_file, write_product
+from roadscan.tiles.tasks.tile_figures import APART_FIGURE, apart_in_tile
+from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, Block, TileTask
 from roadscan.tiles.tasks.tile_points import load_tiles
 
 
@@ -148,7 +144,7 @@ def computed_tiles(task: TileTask, fates: ReadingCounts) -> Iterator[ComputedTil
             content = None if counted.cells is None else Tile(None, counted.cells)
             yield ComputedTile(counted.tile, content, counted.evidence, counted.failure)
         return
-    from roadscan.tiles.statistics import cells_of
+    from roadscan.tiles.accumulator import cells_of
 
     for loaded in load_tiles(task, fates):
         if loaded.points is not None:
@@ -172,7 +168,7 @@ def _write_tile(task: TileTask, key: str, content: Tile, evidence: TileEvidence,
     write_cells(path, cells, task.cell_table)
     figures = _figures(cells, evidence)
     if content.points is not None and (apart := apart_in_tile(content.points, task.ground.grid, task.passes)):
-        figures[PASSES_APART] = apart
+        figures[APART_FIGURE] = apart
     detail = json.dumps(figures)
     records.append(
         publish_file(task.store, path, f"tiles/cells/{unit}.parquet", TILE, unit, key, detail)

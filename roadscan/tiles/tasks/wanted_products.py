@@ -1,16 +1,21 @@
-"""Products that a survey file requests, with their checked settings, and their context."""
+"""What a run is asked for: products with their checked settings and their context, and tiles."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
+
 from roadscan.core.errors import ConfigError
+from roadscan.core.grid import Bounds, TileGrid, TileId
 from roadscan.core.strict import Strict
 from roadscan.core.survey import Survey
+from roadscan.footprints.footprints import FootprintRanges
 from roadscan.georeference.plan.plan import SurveyPlan
-from roadscan.run.code_reach import code_digest, name_of
-from roadscan.run.engine.fingerprint import key_of
+from roadscan.run.keys import code_digest, key_of, name_of
+from roadscan.run.session import Selection, SelectionError
 from roadscan.surface.reconstruction import SurfaceGrid
 from roadscan.surface.settings import SurfaceConfig
 from roadscan.tiles.product import (
@@ -19,13 +24,14 @@ from roadscan.tiles.product import (
     SurfaceProduct,
     SurveyProduct,
     TileProduct,
+    WantedProduct,
+    WantedSurface,
     is_default,
     product_named,
     products,
 )
-from roadscan.tiles.tasks.tile_files import WantedProduct, WantedSurface
 
-_OF_SURVEY = ("roadscan.tiles.drives:Drives", "roadscan.tiles.mosaics.products:StoredTiles")
+_OF_SURVEY = ("roadscan.tiles.lane_direction:Drives", "roadscan.tiles.mosaics.products:StoredTiles")
 """Code that supplies survey products with their data."""
 
 
@@ -122,3 +128,36 @@ def product_key(product: Product, options: Strict, context: ProductContext) -> s
         product.name, product.version, options.model_dump(mode="json"), code_digest(name_of(type(product)), *around),
         context.survey_id, context.title, context.map, context.grid, stated,
     )  # fmt: skip
+
+
+def chosen_tiles(
+    selection: Selection, known: Iterable[TileId], footprints: FootprintRanges, grid: TileGrid
+) -> list[TileId]:
+    """Return the chosen tiles among those with readings, by row and column."""
+    with_readings = set(known)
+    unknown = [t for t in selection.named if t not in with_readings]
+    if unknown:
+        raise SelectionError(
+            f"no reading touches tile {unknown[0]}", expected="a tile of the survey (see the tile table)"
+        )
+    chosen = set(selection.named)
+    if selection.box is not None:
+        chosen |= {t for t in with_readings if _touches(t, selection.box, grid)}
+    if selection.span_gps_ns is not None:
+        first, last = selection.span_gps_ns
+        rows = (footprints.first_epoch_gps_ns <= last) & (footprints.last_epoch_gps_ns >= first)
+        pairs = np.unique(np.column_stack([footprints.tile_column, footprints.tile_row])[rows], axis=0)
+        chosen |= {TileId(int(c), int(r)) for c, r in pairs}
+    if not chosen:
+        raise SelectionError("the choice holds no tile with readings", expected="tiles of the survey")
+    return sorted(chosen, key=lambda t: (t.row, t.column))
+
+
+def _touches(tile: TileId, box: Bounds, grid: TileGrid) -> bool:
+    own = grid.bounds(tile)
+    return (
+        own.easting_min_m < box.easting_max_m
+        and own.easting_max_m > box.easting_min_m
+        and own.northing_min_m < box.northing_max_m
+        and own.northing_max_m > box.northing_min_m
+    )

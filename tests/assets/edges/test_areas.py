@@ -19,7 +19,7 @@ from roadscan.assets.kinds.shoulder import Shoulder, ShoulderOptions
 from roadscan.assets.kinds.sidewalk import Sidewalk, SidewalkOptions
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.scene import Box, Scene
-from roadscan.compute.edges.across import edge_along
+from roadscan.compute.edges import edge_along
 from roadscan.simulate import Scene as SimulatedScene
 from roadscan.simulate.surface import Surface
 from tests.assets.edges.simulated import SimulatedStreet, town_street

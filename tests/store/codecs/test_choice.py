@@ -74,7 +74,7 @@ def test_streams_hold_the_same(folders: dict[str, Path]) -> None:
 
 def test_another_choice_is_refused() -> None:
     done = subprocess.run(
-        [sys.executable, "-c", "import roadscan.store.codecs.choice"],
+        [sys.executable, "-c", "import roadscan.store.codecs.zlib_stream"],
         env=os.environ | {"ROADSCAN_CODECS": "mine"}, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode and "it is one of: own, library" in done.stderr

@@ -16,7 +16,7 @@ from roadscan.site.cloud_file import Cube, NodeCutter
 from roadscan.store.codecs import copc
 from roadscan.store.codecs.copc import CopcWriter
 from roadscan.store.codecs.las import Layout
-from roadscan.tiles.products.cloud_records import picked
+from roadscan.tiles.products.las import picked
 
 LAYOUT = Layout(6, (), (1e-4,) * 3, MapFrame("EPSG:32632"), "publish")
 OFFSETS = (690_000.0, 5_334_000.0, 500.0)

@@ -19,8 +19,7 @@ from roadscan.door import open_survey
 from roadscan.store.logs import LogRecord, read_log_records, write_log_record
 from roadscan.store.query.sql import query
 from roadscan.store.readings.packed_returns import as_returns
-from roadscan.store.readings.returns import ReturnsReader
-from roadscan.store.readings.row_groups import read_groups
+from roadscan.store.readings.row_groups import ReturnsReader, read_groups
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.store.writer import LogWriter

@@ -14,8 +14,7 @@ import pytest
 
 from roadscan.core.errors import StoreError
 from roadscan.store.codecs.parquet.list_table import is_list_table
-from roadscan.store.readings.profiles import ProfileReader, Profiles
-from roadscan.store.readings.row_groups import read_groups
+from roadscan.store.readings.row_groups import ProfileReader, Profiles, read_groups
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.store.writer import LogWriter, write_parquet

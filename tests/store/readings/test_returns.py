@@ -13,7 +13,7 @@ import pytest
 
 from roadscan.core.errors import StoreError
 from roadscan.store.codecs.parquet.number_table import is_number_table, write_number_table
-from roadscan.store.readings.returns import Returns, ReturnsReader
+from roadscan.store.readings.row_groups import Returns, ReturnsReader
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.store.writer import write_parquet

@@ -9,10 +9,10 @@ import rasterio
 
 from roadscan.core.errors import StoreError
 from roadscan.core.grid import TileId
+from roadscan.tiles.cells import pyramid_of
 from roadscan.tiles.product import Output
 from roadscan.tiles.products.hillshade import shade
 from roadscan.tiles.products.kilometre import Kilometre, KilometreOptions
-from roadscan.tiles.pyramid import pyramid_of
 
 CELL_M = 0.25  # 40 cells along a tile's edge: overviews of 2, 8 and 40 cells
 PIXEL = 2

@@ -14,7 +14,7 @@ from roadscan.core.errors import StoreError
 from roadscan.core.grid import TileGrid, TileId
 from roadscan.tiles.product import Output
 from roadscan.tiles.products.mosaic import Mosaic, MosaicOptions
-from roadscan.tiles.products.sheets import cut_sheets
+from roadscan.tiles.products.raster import cut_sheets
 from tests.workshop import CellsInMemory
 
 QUANTITIES = {

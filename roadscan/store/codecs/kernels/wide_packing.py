@@ -10,8 +10,18 @@ import numpy as np
 from numba.extending import intrinsic
 
 from roadscan.compute.kernel_options import inner, kernel
-from roadscan.compute.kernels.processor import compiles_for
-from roadscan.compute.kernels.vectors import I32, I64, constant, everywhere, instruction, load, picked, start, store
+from roadscan.compute.kernels.vectors import (
+    I32,
+    I64,
+    compiles_for,
+    constant,
+    everywhere,
+    instruction,
+    load,
+    picked,
+    start,
+    store,
+)
 from roadscan.compute.numba_internals import ir, types
 from roadscan.store.codecs.kernels.delta_packing import BLOCK, MINIBLOCK, MINIBLOCKS, widths_of
 

@@ -14,12 +14,12 @@ import numpy as np
 from numba.extending import intrinsic
 
 from roadscan.compute.kernel_options import Kernel, inlined, kernel
-from roadscan.compute.kernels.processor import compiles_for
 from roadscan.compute.kernels.vectors import (
     I8,
     I16,
     I32,
     I64,
+    compiles_for,
     constant,
     everywhere,
     instruction,

@@ -19,10 +19,9 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.store.codecs.choice import LIBRARY
 from roadscan.store.codecs.parquet import pages
 from roadscan.store.codecs.parquet.pages import Value, binary, boolean, i8, i16, i32, i64, listed, struct
-from roadscan.store.codecs.zlib_stream import crc32
+from roadscan.store.codecs.zlib_stream import LIBRARY, crc32
 
 MAGIC: Final = b"PAR1"
 _MOST_VALUES: Final = 1 << 28

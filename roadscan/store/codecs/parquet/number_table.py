@@ -16,11 +16,11 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.store.codecs.choice import LIBRARY
 from roadscan.store.codecs.kernels.byte_planes import LONGEST_RUN_BYTES, encode_runs
 from roadscan.store.codecs.parquet import pages
 from roadscan.store.codecs.parquet.list_table import KINDS, Packed, Page, Writer, chunk
 from roadscan.store.codecs.parquet.pages import Value, binary, i64, struct, varint, zigzag
+from roadscan.store.codecs.zlib_stream import LIBRARY
 
 _SCRATCH: Final = 2048  # values of the scratch line that the kernels need
 
@@ -140,11 +140,10 @@ class _Numbers(Writer):
         return chunk(kind, path, pages.DELTA_BINARY_PACKED, count, place, {})
 
     def _differences(self, values: Array) -> tuple[int, Bytes]:
-        from roadscan.store.codecs.kernels.delta_packing import BLOCK, MINIBLOCKS
-        from roadscan.store.codecs.kernels.delta_packing_int64 import TOO_FAR, encode_long, room_words
+        from roadscan.store.codecs.kernels.delta_packing import BLOCK, MINIBLOCKS, TOO_FAR, encode_long, room_words_long
 
-        if self._room.size < room_words(values.size):
-            self._room = np.empty(room_words(values.size), np.uint64)
+        if self._room.size < room_words_long(values.size):
+            self._room = np.empty(room_words_long(values.size), np.uint64)
         packed = encode_long(np.ascontiguousarray(values), self._room)
         if packed == TOO_FAR:
             return pages.PLAIN, values.astype("<i8").view(np.uint8)

@@ -1,1 +1,0 @@
-"""Edges of roads along drives and reference lines, for assets and for condition."""

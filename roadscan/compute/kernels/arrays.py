@@ -1,0 +1,122 @@
+"""Small loops over arrays: copies, quantiles of sorted values, k-th smallest numbers, and bounds of profiles."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from roadscan.compute.kernel_options import bare, bare_inner, inlined, kernel
+
+
+@bare
+def copy_values(values, out):
+    """Copy values (n,) to the first n elements of `out` (n,), converted to its type."""
+    for k in range(out.size):
+        out[k] = values[k]
+
+
+@inlined
+def sorted_quantile(held, share):
+    """Returns the number below which a share of sorted values (n,) lies, interpolated as NumPy does."""
+    place = (held.size - 1) * share
+    i = int(place)
+    low, high, past = held[i], held[min(i + 1, held.size - 1)], place - i
+    return high - (high - low) * (1.0 - past) if past >= 0.5 else low + (high - low) * past
+
+
+_ONE = np.uint16(1)  # Subtracted from raw ranges in their type, so that 0 (no return) wraps to the largest number.
+
+
+@kernel
+def range_bounds(ranges, low, high):
+    """Write the lowest and the highest range of each profile's returns (not 0); 0 for profiles without any.
+
+    Parameters
+    ----------
+    ranges
+        (n, m) uint16, raw.
+    low, high
+        (n,) uint16, out.
+    """
+    for k in range(ranges.shape[0]):
+        least, most = np.uint16(65535), np.uint16(0)
+        for i in range(ranges.shape[1]):
+            value = ranges[k, i]
+            below = np.uint16(value - _ONE)  # 0 (no return) wraps to the largest number
+            least = below if below < least else least
+            most = value if value > most else most
+        low[k], high[k] = np.uint16(least + _ONE), most
+
+
+BINS = 256  # Bins of one pass over the numbers.
+_BITS = 8  # Binary logarithm of BINS.
+_FEW = 48
+"""Up to this many numbers are sorted directly."""
+
+
+@bare
+def bounds_of(values):
+    """Return the least and greatest of (n,) int32, n > 0."""
+    low, high = values[0], values[0]
+    for i in range(values.size):
+        low, high = min(low, values[i]), max(high, values[i])
+    return np.int64(low), np.int64(high)
+
+
+@bare
+def _count(values, low, shift, bins):
+    bins[:] = 0
+    for i in range(values.size):
+        bins[np.uint64(np.int64(values[i]) - low) >> shift] += np.int32(1)
+
+
+@bare_inner
+def _of_bin(values, low, shift, wanted, found):
+    n = 0
+    for i in range(values.size):
+        found[n] = values[i]
+        n += np.int64((np.uint64(np.int64(values[i]) - low) >> shift) == wanted)
+    return n
+
+
+@bare
+def sort_few(values):
+    """Sort few numbers (n,) by insertion."""
+    for i in range(1, values.size):
+        own, j = values[i], i
+        while j > 0 and values[j - 1] > own:
+            values[j] = values[j - 1]
+            j -= 1
+        values[j] = own
+
+
+@bare
+def smallest(values, k, bins, found):
+    """Return the k-th smallest (from 0) of numbers.
+
+    Parameters
+    ----------
+    values : (n,) int32, n > k; they may change places. bins : (BINS,) int32, found : (≥ n + 1,) int32, work.
+
+    Returns
+    -------
+    int64
+    """
+    while values.size > _FEW:
+        low, high = bounds_of(values)
+        shift, span = np.uint64(0), high - low
+        while span >= BINS:
+            span >>= 1
+            shift += np.uint64(1)
+        _count(values, low, shift, bins)
+        bin_, before = 0, 0
+        while before + bins[bin_] <= k:
+            before += bins[bin_]
+            bin_ += 1
+        if shift == 0:
+            return low + bin_
+        n = _of_bin(values, low, shift, np.uint64(bin_), found)
+        for i in range(n):
+            values[i] = found[i]
+        values, k = values[:n], k - before
+    sort_few(values)
+    return np.int64(values[k])

@@ -31,6 +31,11 @@ class Grid(NamedTuple):
         return self.rows, self.columns
 
     @property
+    def corner(self) -> tuple[int, int]:
+        """Returns row and column of the first cell, counted from the place from which coordinates count."""
+        return round(self.y_min_m / self.cell_m), round(self.x_min_m / self.cell_m)
+
+    @property
     def middles_m(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Returns the middles of the columns (x) and of the rows (y) (m)."""
         x = self.x_min_m + (np.arange(self.columns, dtype=np.float64) + 0.5) * self.cell_m

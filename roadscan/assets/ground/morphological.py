@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.ground.filling import filled
+from roadscan.assets.ground.grid import Grid
 from roadscan.assets.ground.settings import GroundSettings
 from roadscan.assets.kernels.ground_cells import least_over_disk
 from roadscan.compute.array_types import Float32
@@ -63,18 +64,18 @@ def objects(surface: Float32, cell_m: float, steepest: float, largest_m: float) 
     return found[margin:-margin, margin:-margin]
 
 
-def without_pits(lowest_m: Float32, pit_m: float) -> tuple[Float32, Bools]:
+def without_pits(lowest_m: Float32, pit_m: float, grid: Grid) -> tuple[Float32, Bools]:
     """Returns the whole surface of the lowest returns without those in pits, and a mask of the cells that it has.
 
     lowest_m : (rows, columns), inf where a cell has no return.
     pit_m : a lowest return is noise where it lies below the surface around by more.
     """
     known = np.isfinite(lowest_m)
-    surface = filled(lowest_m, known)
+    surface = filled(lowest_m, known, grid.corner, grid.cell_m)
     pits = -surface - opened(-surface, 1) > pit_m
     if (pits & known).any():
         known &= ~pits
-        surface = filled(lowest_m, known)
+        surface = filled(lowest_m, known, grid.corner, grid.cell_m)
     return surface, known
 
 

@@ -76,7 +76,7 @@ def above_planes(place: Place, grid: Grid, on_ground: npt.NDArray[np.bool_]) -> 
     lowest = np.full(grid.shape, np.inf, np.float32)
     x, y, z = returns.x_m, returns.y_m, returns.height_m
     lowest_returns(x[on_ground], y[on_ground], z[on_ground], grid.origin, 1.0 / grid.cell_m, lowest)
-    base = Surface(grid, filled(lowest, np.isfinite(lowest)))
+    base = Surface(grid, filled(lowest, np.isfinite(lowest), grid.corner, grid.cell_m))
     above = np.empty(len(returns), np.float32)
     heights_above(x, y, z, grid.origin, 1.0 / grid.cell_m, base.height_m, above)
     return Found(base, above, on_ground)

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.ground.filling import distances, filled
-from roadscan.assets.ground.grid import grid_over
+from roadscan.assets.ground.grid import Grid, grid_over
 from roadscan.assets.ground.surface import Found, Place
 from roadscan.assets.kernels.ground_cells import cell_heights
 from roadscan.assets.scene import GroundModel
@@ -38,15 +38,17 @@ def ground_model(place: Place, found: Found) -> GroundModel:
         middle, scatter = means(sums, middle)
         half = np.maximum(np.float32(_TIMES) * scatter, np.float32(_LEAST_M))
     seen = sums[..., 0] > 0
-    height = filled(found.base.at(grid) + middle, seen)
+    height = filled(found.base.at(grid) + middle, seen, grid.corner, grid.cell_m)
     away = distances(seen, grid.cell_m)
-    sigma = sigmas(sums[..., 0], scatter, away, place.statistics)
+    sigma = sigmas(sums[..., 0], scatter, away, grid, place.statistics)
     for array in (height, sigma):
         array[(away > place.settings.reach_m) | ~seen.any()] = np.nan
     return GroundModel(grid.x_min_m, grid.y_min_m, grid.cell_m, height, seen, sigma)
 
 
-def sigmas(count: npt.NDArray[np.float64], scatter: Float32, away_m: Float32, statistics: Statistics) -> Float32:
+def sigmas(
+    count: npt.NDArray[np.float64], scatter: Float32, away_m: Float32, grid: Grid, statistics: Statistics
+) -> Float32:
     """Returns 1 σ (rows, columns) of the heights of cells: of a mean where returns were seen, else by distance.
 
     count : returns of each cell; scatter : their standard deviation (m), which few returns underestimate: it is no less
@@ -58,7 +60,9 @@ def sigmas(count: npt.NDArray[np.float64], scatter: Float32, away_m: Float32, st
     usual = np.float32(_UNKNOWN_M if told is None else told)
     single = np.where(several, scatter, np.maximum(scatter, usual))
     mean = (single / np.sqrt(np.maximum(count, 1.0))).astype(np.float32)
-    return np.asarray(np.hypot(filled(mean, seen), np.where(seen, 0.0, _GROWTH * away_m)), np.float32)
+    return np.asarray(
+        np.hypot(filled(mean, seen, grid.corner, grid.cell_m), np.where(seen, 0.0, _GROWTH * away_m)), np.float32
+    )
 
 
 def means(sums: npt.NDArray[np.float64], middle: Float32) -> tuple[Float32, Float32]:

@@ -1,7 +1,7 @@
 """Whether the stated probabilities of assets mean what they say, and the curves that make them so.
 
-Curves (`roadscan/assets/calibration.py`) are fitted to the objects of some drawn streets. Others, which take no part in
-that, are held against them: ten drawn ones, and the town and the motorway of `asset_streets`. The error is the mean
+Curves (`roadscan/assets/probabilities.py`) are fitted to the objects of some drawn streets. Others, which take no part
+in that, are held against them: ten drawn ones, and the town and the motorway of `asset_streets`. The error is the mean
 distance between stated probability and share that is right, over ten bins (expected calibration error).
 """
 
@@ -20,8 +20,8 @@ from benchmarks.asset_streets import motorway, processed, town
 from benchmarks.drawn_streets import drawn_street
 from benchmarks.settings import bench_folder
 from benchmarks.timing import Figure
-from roadscan.assets.calibration import CURVES, Curve
 from roadscan.assets.kind import asset_kinds
+from roadscan.assets.probabilities import CURVES, Curve
 
 FITTED_ON: Final = range(100, 140)
 HELD_OUT: Final = range(10)

@@ -14,10 +14,9 @@ import pyarrow as pa
 from benchmarks.timing import Figure
 from roadscan.assets.intensity import calibrated_scene, gains_of, intensity_sample
 from roadscan.assets.kind import asset_kinds
-from roadscan.assets.statistics import Statistics
-from roadscan.assets.tasks.kinds import wanted_kinds
+from roadscan.assets.scene import Statistics
 from roadscan.assets.tasks.load_returns import load_squares, scene_of
-from roadscan.assets.tasks.plan import AssetPlan, plan_assets
+from roadscan.assets.tasks.plan import AssetPlan, plan_assets, wanted_kinds
 from roadscan.footprints.footprints import footprints_of
 from roadscan.georeference.plan.plan import plan_of
 from roadscan.run.session import Session

@@ -21,10 +21,10 @@ import numpy.typing as npt
 from benchmarks import ground_filters
 from benchmarks.ground_filters import Sample
 from benchmarks.timing import Figure
-from roadscan.assets.ground.settings import GroundSettings
 from roadscan.assets.ground.sparse import SparseRules, sparse_ground
 from roadscan.assets.ground.surface import Place
 from roadscan.assets.scene import Box
+from roadscan.assets.settings import GroundSettings
 from tests.assets.airborne import airborne
 from tests.assets.isprs import SAMPLES, isprs_sample
 

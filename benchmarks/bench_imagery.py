@@ -35,7 +35,7 @@ from benchmarks.painted_objects import (
     written,
 )
 from roadscan.assets.intensity import ON_GROUND_M, calibrated_scene
-from roadscan.assets.statistics import Statistics
+from roadscan.assets.scene import Statistics
 from roadscan.assets.tasks.load_returns import load_squares, scene_of
 from roadscan.assets.tasks.plan import asset_grid, readings_of
 from roadscan.assets.tasks.work import plan_evidence

@@ -24,8 +24,7 @@ import numpy.typing as npt
 
 from benchmarks.sign_faces import FACES
 from benchmarks.sign_renders import HELD_OUT, MORE, SIZES_PX, UNLISTED, face_drawing, seen, size_by_chance
-from roadscan.assets.pictures.sign_features import COUNT, features_of
-from roadscan.assets.pictures.sign_types import FILE, MOST_HIDDEN, UNKNOWN, SignTypes, made_of
+from roadscan.assets.pictures.sign_types import COUNT, FILE, MOST_HIDDEN, UNKNOWN, SignTypes, features_of, made_of
 
 Float32 = npt.NDArray[np.float32]
 

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from benchmarks.judge_wire import parts_of, streets
 from benchmarks.judgement import Segments
 from benchmarks.labelled_returns import LabelledReturns
-from roadscan.assets.covers.spots import Spot, spots_of
+from roadscan.assets.kinds.cover import Spot, spots_of
 
 _TYPES: Final = ("cover", "drain")
 _SURE: Final = 0.6

@@ -20,7 +20,7 @@ from benchmarks.judgement import Segments
 from benchmarks.labelled_returns import LabelledReturns, labelled_returns, scene_about
 from benchmarks.labelled_scenes import labelled_scenes
 from benchmarks.labelled_street import recording_folder
-from roadscan.assets.furniture.compact import Compact, compact_things
+from roadscan.assets.kinds.street_furniture import Compact, compact_things
 from roadscan.simulate import Scene as Street
 
 TYPES: Final = ("cabinet", "bin", "bench", "hydrant", "bus_shelter")

@@ -11,8 +11,7 @@ import numpy as np
 
 from benchmarks.edge_scenes import JudgedScene, judged_scenes
 from benchmarks.judgement import Segments, with_unknown
-from roadscan.assets.edges.free import open_edges
-from roadscan.assets.edges.node_features import node_features
+from roadscan.assets.edges.find import node_features, open_edges
 
 UNKNOWN: Final = ("crossing", "outward")
 """Features that a cloud without drives and places of its sensor does not tell."""

@@ -10,9 +10,8 @@ import numpy as np
 
 from benchmarks.edge_scenes import JudgedScene, judged_scenes
 from benchmarks.judgement import Segments
-from roadscan.assets.paint.component_features import component_features
-from roadscan.assets.paint.components import components_of
-from roadscan.assets.paint.contrast import contrast_of
+from roadscan.assets.paint.components import components_of, contrast_of
+from roadscan.assets.paint.detection import component_features
 
 FIT: Final = {"min_data_in_leaf": 25, "num_leaves": 6, "rounds": 120, "increasing": ("length_m", "slim", "evidence")}
 """A longer, slimmer or clearer component is never less probable: few streets have lines of 30 m."""

@@ -11,10 +11,9 @@ import numpy.typing as npt
 
 from benchmarks.judged_scenes import POLE, TRUNK, UNKNOWN, JudgedScene, judged_scenes
 from benchmarks.judgement import Segments
-from roadscan.assets.upright.places import places_of
-from roadscan.assets.upright.shaft_features import features_of
 from roadscan.assets.upright.shafts import Shaft
-from roadscan.assets.upright.standing import candidates_of
+from roadscan.assets.upright.slices import places_of
+from roadscan.assets.upright.standing import candidates_of, features_of
 
 FIT: Final[dict[str, Any]] = {
     "increasing": ("slices", "alone", "free", "filled", "alone_lower", "alone_upper", "to_surface_m", "returns"),

@@ -21,9 +21,9 @@ from benchmarks.labelled_scenes import labelled_scenes
 from benchmarks.labelled_street import recording_folder
 from benchmarks.street_scores import NOT_JUDGED, SIGN
 from roadscan.assets.intensity import calibrated_scene, gains_of, intensity_sample
+from roadscan.assets.kinds.sign import Plate, SignOptions, candidates_of
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.scene import Box, Scene
-from roadscan.assets.upright.plates import Plate, SignOptions, candidates_of
 from roadscan.simulate import Scene as Street
 
 HARD: Final = (*range(700, 708), *range(712, 716))

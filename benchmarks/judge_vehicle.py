@@ -11,9 +11,9 @@ import numpy as np
 from benchmarks.judged_scenes import PERSON, UNKNOWN, VEHICLE, JudgedScene, judged_scenes
 from benchmarks.judgement import Segments
 from roadscan.assets import classes
-from roadscan.assets.cubes import cubes_of
 from roadscan.assets.moving import CELL_M, LEVEL_M, TALL, columns_of, driven_cells, moving_cells
 from roadscan.assets.road_users import Bodies, groups_of
+from roadscan.assets.surroundings import cubes_of
 
 FIT: Final[dict[str, Any]] = {
     "increasing": ("planarity", "fill", "ground_around", "upright", "slanting", "level"),

@@ -19,9 +19,8 @@ from benchmarks.judgement import Segments
 from benchmarks.labelled_returns import LabelledReturns, labelled_returns, scene_about
 from benchmarks.labelled_scenes import labelled_scenes
 from benchmarks.labelled_street import recording_folder
+from roadscan.assets.kinds.wire import features_of, spans_of, thin_cubes
 from roadscan.assets.scene import Scene
-from roadscan.assets.wires.spans import features_of, spans_of
-from roadscan.assets.wires.thin import thin_cubes
 
 HARD: Final = range(26)
 COVERED: Final = range(500, 516)

@@ -23,8 +23,7 @@ from benchmarks.street_scores import POLE as POLE_LABEL
 from benchmarks.street_scores import SIGN as SIGN_LABEL
 from benchmarks.street_scores import TRUNK as TRUNK_LABEL
 from roadscan.assets.make_scene import make_scene
-from roadscan.assets.returns import Returns
-from roadscan.assets.scene import Box, Scene
+from roadscan.assets.scene import Box, Returns, Scene
 from roadscan.simulate import Scene as Street
 
 Float64 = npt.NDArray[np.float64]

@@ -6,7 +6,7 @@ A training script calls, once a seed:
     from benchmarks.labelled_returns import CLASSES, labelled_returns
 
     street = labelled_returns(hard_street(seed))
-    street.returns       # roadscan.assets.returns.Returns (n): place, intensity, laser, epoch, pass, sensor's place
+    street.returns       # roadscan.assets.scene.Returns (n): place, intensity, laser, epoch, pass, sensor's place
     street.class_id      # (n,) number of the semantic class of each return, an index of CLASSES
     street.object_id     # (n,) the object of the truth that it met; 0: the ground, -1: noise
     street.kind          # (n,) kind of that object, an index of street.kinds
@@ -25,8 +25,7 @@ import numpy.typing as npt
 import pandas as pd
 
 from roadscan.assets.make_scene import make_scene
-from roadscan.assets.returns import Returns
-from roadscan.assets.scene import Box
+from roadscan.assets.scene import Box, Returns
 from roadscan.assets.scene import Scene as AssetScene
 from roadscan.simulate import Scene
 from roadscan.simulate.bodies import CLASSES, class_number, class_of_kind

@@ -11,8 +11,7 @@ from scipy.spatial import cKDTree
 
 from benchmarks.labelled_street import labelled_street
 from roadscan.assets.intensity import calibrated_scene
-from roadscan.assets.scene import Scene
-from roadscan.assets.statistics import Statistics
+from roadscan.assets.scene import Scene, Statistics
 from roadscan.assets.tasks.gains import current_gains, plan_gains
 from roadscan.assets.tasks.load_returns import load_squares, scene_of
 from roadscan.assets.tasks.plan import plan_assets

@@ -21,9 +21,13 @@ import numpy.typing as npt  # noqa: E402
 
 from roadscan.assets.files.thumbnails import EDGE_PX, drawn_from_above, drawn_from_side  # noqa: E402
 from roadscan.assets.intensity import calibrated_scene, gains_of, intensity_sample  # noqa: E402
-from roadscan.assets.kind import AssetObject, Marked, asset_kinds  # noqa: E402
+from roadscan.assets.kind import (  # noqa: E402
+    AssetObject,
+    Marked,
+    asset_kinds,
+    reference_point,
+)
 from roadscan.assets.make_scene import make_scene  # noqa: E402
-from roadscan.assets.object_table import reference_point  # noqa: E402
 from roadscan.assets.scene import Box, Scene  # noqa: E402
 from roadscan.assets.tasks.evidence import marked_classes  # noqa: E402
 from roadscan.simulate.scene import Scene as StreetScene  # noqa: E402

@@ -15,7 +15,7 @@ from PIL import Image
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 
-from roadscan.assets.edges.raster import raster_of
+from roadscan.assets.edges.steps import raster_of
 from roadscan.assets.kind import AssetKind, AssetObject
 from roadscan.assets.kinds.kerb import Kerb
 from roadscan.assets.kinds.median import Median

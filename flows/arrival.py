@@ -12,7 +12,7 @@ from prefect.client.schemas.objects import State
 from prefect.states import Completed
 
 from roadscan.assets.settings import AssetsConfig
-from roadscan.assets.tasks.kinds import wanted_kinds
+from roadscan.assets.tasks.plan import wanted_kinds
 from roadscan.core.errors import RoadscanError, RunError, StoreError, may_pass
 from roadscan.flows.conduct import end_with_worker
 from roadscan.flows.expected import failed

@@ -20,10 +20,8 @@ import rasterio
 from typer.testing import CliRunner
 
 from docs import generate
-from roadscan.assets.kind import asset_kinds
-from roadscan.assets.object_table import table_of_objects
-from roadscan.assets.returns import Returns
-from roadscan.assets.scene import Box, GroundModel, Scene
+from roadscan.assets.kind import asset_kinds, table_of_objects
+from roadscan.assets.scene import Box, GroundModel, Returns, Scene
 from roadscan.cli import app
 from roadscan.core.crs import MapFrame
 from roadscan.core.errors import StoreError

@@ -1,1 +1,1 @@
-"""Assets: objects on, beside and over the road, found in returns of lidars and scanners; each kind is one file."""
+"""Assets: objects on, beside and over the road, found in returns of lidars and scanners; `kinds` holds what is a kind."""

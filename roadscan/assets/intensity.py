@@ -24,9 +24,8 @@ import pyarrow as pa
 
 from roadscan.assets.kernels.beams import log_gains, meet_ground
 from roadscan.assets.quantiles import weighted_quantile
-from roadscan.assets.returns import Returns
-from roadscan.assets.scene import GroundModel, Scene
-from roadscan.compute.array_types import Float64, Int64
+from roadscan.assets.scene import GroundModel, Returns, Scene
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.compute.kernel_options import read_only
 from roadscan.compute.robust import scatter_about
 
@@ -277,7 +276,7 @@ def incidence_deg(returns: Returns, ground: GroundModel) -> Float64:
     return _beams(returns, ground, np.ones(len(returns), np.bool_))[1]
 
 
-def _beams(returns: Returns, ground: GroundModel, wanted: npt.NDArray[np.bool_]) -> tuple[Float64, Float64]:
+def _beams(returns: Returns, ground: GroundModel, wanted: Bool) -> tuple[Float64, Float64]:
     """Range (n,) of each return (m), and the angle of incidence of the wanted ones (deg); 0 of all others."""
     range_m, cosine = np.empty(len(returns)), np.empty(len(returns))
     place = tuple(map(read_only, (returns.x_m, returns.y_m, returns.height_m)))

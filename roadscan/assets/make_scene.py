@@ -8,19 +8,16 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets import classes
-from roadscan.assets.cubes import cubes_of
-from roadscan.assets.ground.bare_earth import bare_earth
-from roadscan.assets.ground.road import road_cells
-from roadscan.assets.ground.settings import GroundSettings
+from roadscan.assets.ground.bare_earth import bare_earth, road_cells
 from roadscan.assets.ground.surface import Place
 from roadscan.assets.kernels.columns import marked
 from roadscan.assets.moving import REACH_M as ROAD_USERS_M
-from roadscan.assets.returns import Returns
 from roadscan.assets.road_users import road_users
-from roadscan.assets.scene import Box, GroundModel, Scene, extent_of
-from roadscan.assets.statistics import Statistics
+from roadscan.assets.scene import Box, GroundModel, Returns, Scene, Statistics, extent_of
+from roadscan.assets.settings import GroundSettings
 from roadscan.assets.surroundings import REACH_M as SURROUNDINGS_M
-from roadscan.assets.surroundings import surroundings
+from roadscan.assets.surroundings import cubes_of, surroundings
+from roadscan.compute.array_types import Bool
 
 CLASSES_REACH_M: Final = max(ROAD_USERS_M, SURROUNDINGS_M)
 """What lies farther away (m) does not change the class of a return that does not lie on the ground."""
@@ -74,7 +71,7 @@ def make_scene(
     return Scene(returns, tile, window, ground.model, ground.above_m, found, drive, statistics)
 
 
-def on_road(returns: Returns, model: GroundModel, drive_xyh_m: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+def on_road(returns: Returns, model: GroundModel, drive_xyh_m: npt.NDArray[np.float64]) -> Bool:
     """Returns a mask (n,) of the returns above cells that are known to be road."""
     cells = road_cells(model, drive_xyh_m).astype(np.int32)
     at = np.empty(len(returns), np.int32)

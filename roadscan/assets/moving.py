@@ -8,16 +8,13 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.assets.ground.grid import Grid, grid_over
+from roadscan.assets.ground.surface import Grid, grid_over
 from roadscan.assets.kernels import columns
-from roadscan.assets.kernels.corridors import mark_corridor
+from roadscan.assets.kernels.columns import mark_corridor
 from roadscan.assets.quantiles import quantiles
-from roadscan.assets.returns import Returns
-from roadscan.assets.scene import Box
-from roadscan.compute.array_types import Int32
+from roadscan.assets.scene import Box, Returns
+from roadscan.compute.array_types import Bool, Int32
 from roadscan.core.extras import cv2
-
-Bools = npt.NDArray[np.bool_]
 
 REACH_M: Final = 8.0
 """A vehicle of 7 m with the ground around it, by which it is told from other things, lies within this (m)."""
@@ -64,7 +61,7 @@ class Columns(NamedTuple):
     """(rows, columns, words) slots of time in which things, ground and higher things were seen, as bits."""
 
 
-def columns_of(returns: Returns, above_m: npt.NDArray[np.float32], on_ground: Bools, window: Box) -> Columns:
+def columns_of(returns: Returns, above_m: npt.NDArray[np.float32], on_ground: Bool, window: Box) -> Columns:
     """Returns what stands in each cell of a window, and when it was seen."""
     grid = grid_over(window, CELL_M)
     levels = np.zeros(grid.shape, np.uint32)
@@ -93,7 +90,7 @@ def number_of(slots: npt.NDArray[np.uint64]) -> npt.NDArray[np.int64]:
     return np.asarray(np.bitwise_count(slots).sum(axis=-1, dtype=np.int64))
 
 
-def moving_cells(held: Columns) -> Bools:
+def moving_cells(held: Columns) -> Bool:
     """Mask (rows, columns) of cells where things were seen for a while, and longer the ground without them."""
     things = number_of(held.things)
     free = number_of(held.grounds & ~held.things)
@@ -106,7 +103,7 @@ def moving_cells(held: Columns) -> Bools:
     return np.asarray((things > 0) & ~stays & (2 * around >= _around(things > 0)) & (around >= 3))
 
 
-def driven_cells(held: Columns, drive_xyh_m: npt.NDArray[np.float64]) -> Bools:
+def driven_cells(held: Columns, drive_xyh_m: npt.NDArray[np.float64]) -> Bool:
     """Mask (rows, columns) of cells where things were seen in the way of a drive, which went through: they moved.
 
     drive_xyh_m : (p, 4) x, y and height of the sensor (m) and the pass, in the order of time.
@@ -118,12 +115,12 @@ def driven_cells(held: Columns, drive_xyh_m: npt.NDArray[np.float64]) -> Bools:
     return inside & ((held.levels & np.uint32(_DRIVEN_LEVELS)) > 0)
 
 
-def _around(cells: Bools) -> Int32:
+def _around(cells: Bool) -> Int32:
     counted = cv2.boxFilter(cells.view(np.uint8), cv2.CV_32S, (3, 3), None, (-1, -1), False, cv2.BORDER_CONSTANT)
     return np.asarray(counted, np.int32)
 
 
-def tracks(held: Columns, moving: Bools) -> tuple[Int32, Int32]:
+def tracks(held: Columns, moving: Bool) -> tuple[Int32, Int32]:
     """Returns the level of moving vehicles and people, in the cells of their tracks (rows, columns); 0 elsewhere."""
     count, label, boxes, _ = cv2.connectedComponentsWithStats(moving.view(np.uint8), connectivity=8)
     vehicle, person = np.zeros(label.shape, np.int32), np.zeros(label.shape, np.int32)
@@ -149,7 +146,7 @@ def tracks(held: Columns, moving: Bools) -> tuple[Int32, Int32]:
     return vehicle, person
 
 
-def load_levels(held: Columns, part: tuple[slice, slice], inside: Bools) -> Int32:
+def load_levels(held: Columns, part: tuple[slice, slice], inside: Bool) -> Int32:
     """Level (rows, columns) of loads that move along a vehicle's track and are higher than cars; 0 elsewhere.
 
     A load is seen in the slots of the track's lower things, or in those beside them, and in no others:
@@ -193,14 +190,14 @@ def _shifted(bits: npt.NDArray[np.uint64], step: int, axis: int) -> npt.NDArray[
     return out
 
 
-def sides_m(cells: Bools) -> tuple[float, float]:
+def sides_m(cells: Bool) -> tuple[float, float]:
     """Length and width of the smallest rectangle about the middles of cells (rows, columns), a cell added (m)."""
     row, column = np.nonzero(cells)
     sides = cv2.minAreaRect(np.column_stack([column, row]).astype(np.float32))[1]
     return (max(sides) + 1.0) * CELL_M, (min(sides) + 1.0) * CELL_M
 
 
-def returns_of(reached: Int32, held: Columns, returns: Returns, above_m: npt.NDArray[np.float32]) -> Bools:
+def returns_of(reached: Int32, held: Columns, returns: Returns, above_m: npt.NDArray[np.float32]) -> Bool:
     """Returns a mask (n,) of returns in cells up to the level that is reached there, and one more."""
     most = TALLEST + 2
     lowest, highest = np.full(most + 1, -0.2), (np.arange(most + 1) + 1.0) * LEVEL_M

@@ -8,9 +8,9 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.assets.cubes import Cubes
 from roadscan.assets.judgement.judge import Judge
-from roadscan.assets.kernels import columns, voxels
+from roadscan.assets.kernels import columns
+from roadscan.assets.kernels import cubes as voxels
 from roadscan.assets.moving import (
     CELL_M,
     LEVEL_M,
@@ -24,12 +24,10 @@ from roadscan.assets.moving import (
     tracks,
 )
 from roadscan.assets.quantiles import quantiles
-from roadscan.assets.returns import Returns
-from roadscan.assets.scene import Box
-from roadscan.compute.array_types import Float64, Int32
+from roadscan.assets.scene import Box, Returns
+from roadscan.assets.surroundings import Cubes
+from roadscan.compute.array_types import Bool, Float64, Int32
 from roadscan.core.extras import cv2
-
-Bools = npt.NDArray[np.bool_]
 
 VEHICLE: Final = Judge("vehicle", "9028bd8bc57751fb")
 """Is a group of cells a vehicle, a part of one, or a row of them?"""
@@ -70,8 +68,8 @@ _STEEP, _LEVEL = 0.3, 0.9
 class Users(NamedTuple):
     """Masks (n,) of the returns of road users."""
 
-    vehicle: Bools
-    person: Bools
+    vehicle: Bool
+    person: Bool
 
 
 class Bodies(NamedTuple):
@@ -79,7 +77,7 @@ class Bodies(NamedTuple):
 
     returns: Returns
     above_m: npt.NDArray[np.float32]
-    on_ground: Bools
+    on_ground: Bool
     cubes: Cubes
 
 
@@ -99,7 +97,7 @@ class Groups(NamedTuple):
 
 
 def road_users(
-    returns: Returns, above_m: npt.NDArray[np.float32], on_ground: Bools, cubes: Cubes, window: Box,
+    returns: Returns, above_m: npt.NDArray[np.float32], on_ground: Bool, cubes: Cubes, window: Box,
     drive_xyh_m: Float64,
 ) -> Users:  # fmt: skip
     """Returns masks of vehicles and people among the returns that do not lie on the ground."""
@@ -113,7 +111,7 @@ def road_users(
     )
 
 
-def parked_cells(raster: Columns, moving: Bools, bodies: Bodies) -> Int32:
+def parked_cells(raster: Columns, moving: Bool, bodies: Bodies) -> Int32:
     """Returns the level of parked vehicles, in their cells (rows, columns); 0 elsewhere.
 
     What stands beside cars may touch them: a vehicle with a straight line is judged once more without it, part by part.
@@ -138,7 +136,7 @@ def parked_cells(raster: Columns, moving: Bools, bodies: Bodies) -> Int32:
     return found
 
 
-def _are_vehicles(groups: Groups) -> Bools:
+def _are_vehicles(groups: Groups) -> Bool:
     """Returns which groups (k,) are vehicles."""
     if not groups.number.size:
         return np.zeros(0, np.bool_)
@@ -146,7 +144,7 @@ def _are_vehicles(groups: Groups) -> Bools:
     return VEHICLE.probability(groups.features) >= np.where(is_bush, _LEAST_LEAFY, _LEAST)
 
 
-def straight_lines(groups: Groups, which: Bools) -> Bools:
+def straight_lines(groups: Groups, which: Bool) -> Bool:
     """Returns a mask (rows, columns) of the straight lines in some of the groups; which : (k,)."""
     out = np.zeros(groups.label.shape, np.bool_)
     # a line over the diagonal of its box has that many columns, or rows
@@ -164,7 +162,7 @@ def straight_lines(groups: Groups, which: Bools) -> Bools:
     return out
 
 
-def _upper_part(levels: npt.NDArray[np.uint32], free: Bools, body: Bools) -> tuple[Bools, Int32]:
+def _upper_part(levels: npt.NDArray[np.uint32], free: Bool, body: Bool) -> tuple[Bool, Int32]:
     """Returns the cells (rows, columns) of what is higher than the body of a vehicle and belongs to it, and its level.
 
     The ends of a cabin rise behind a bonnet: nothing of them is seen at the height of the body. They belong to it where
@@ -178,7 +176,7 @@ def _upper_part(levels: npt.NDArray[np.uint32], free: Bools, body: Bools) -> tup
     return np.isin(label, [k for k in touching if min(sides_m(label == k)) >= _CABIN_M]), highest
 
 
-def groups_of(raster: Columns, moving: Bools, bodies: Bodies, apart: Bools | None = None) -> Groups:
+def groups_of(raster: Columns, moving: Bool, bodies: Bodies, apart: Bool | None = None) -> Groups:
     """Returns the groups of a window, with their features: lengths in metres, shares of cells and of returns.
 
     None of them counts returns, so that they mean the same for any scanner and any number of passes. Cells that are set
@@ -237,12 +235,12 @@ def _plan_of(raster: Columns, label: Int32, number: int, part: tuple[slice, slic
     }  # fmt: skip
 
 
-def _enclosed(inside: Bools) -> float:
+def _enclosed(inside: Bool) -> float:
     """Returns the share of the cells of a group whose eight neighbours belong to it: 0 of thin, branched groups."""
     return float(cv2.erode(inside.view(np.uint8), np.ones((3, 3), np.uint8)).sum() / np.count_nonzero(inside))
 
 
-def ground_around(inside: Bools, ground: Bools) -> float:
+def ground_around(inside: Bool, ground: Bool) -> float:
     """Returns the share of the cells in a ring about some cells (rows, columns) in which ground was seen."""
     near = cv2.dilate(inside.view(np.uint8), np.ones((3, 3), np.uint8))
     ring = cv2.dilate(inside.view(np.uint8), np.ones((7, 7), np.uint8)) > near

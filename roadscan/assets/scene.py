@@ -1,20 +1,154 @@
-"""Scenes, the input of the detection of assets: returns with height above the ground and class."""
+"""Scenes, the input of the detection of assets: returns with height above the ground and class; statistics, cache."""
 
 from __future__ import annotations
 
+import functools
 import math
-from dataclasses import dataclass, field, replace
+import weakref
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, Final, NamedTuple, Self, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.kernels.beams import ground_heights
-from roadscan.assets.returns import Returns
-from roadscan.assets.statistics import Statistics
-from roadscan.compute.array_types import Float32, Float64
+from roadscan.assets.quantiles import weighted_quantile
+from roadscan.compute.array_types import Bool, Float32, Float64
 from roadscan.compute.kernel_options import read_only
+
+
+@dataclass(frozen=True, eq=False)
+class Returns:
+    """Returns (n,) of an asset tile and its halo, in canonical order, so that equal readings give equal bytes.
+
+    Coordinates count from `corner_m`, a corner of the tile in the map: x to the east, y to the north (m). Heights are
+    those of the map frame.
+    """
+
+    corner_m: tuple[float, float]
+    """Easting and northing of the corner from which x and y count (m)."""
+    x_m: Float64
+    y_m: Float64
+    height_m: Float64
+    intensity: Float32
+    """As recorded, or calibrated where the survey has gains (`calibrated`); digital numbers of 16 bits."""
+    epoch_gps_ns: npt.NDArray[np.int64]
+    pass_id: npt.NDArray[np.uint16]
+    """Number of the pass of the survey that saw it: a drive of a lane."""
+    sensor: npt.NDArray[np.uint8]
+    """Number of the sensor, an index of `sensors`."""
+    laser: npt.NDArray[np.uint16]
+    """Laser of the sensor (ring), 0 for scanners with one."""
+    return_number: npt.NDArray[np.uint8]
+    """1 for the first return of a pulse."""
+    number_of_returns: npt.NDArray[np.uint8]
+    sensor_x_m: Float64
+    """Position of the sensor when it saw the return: x, y from `corner_m` and height, like those of the return."""
+    sensor_y_m: Float64
+    sensor_height_m: Float64
+    sensors: tuple[str, ...] = ()
+    """Names of the sensors."""
+    divergence_deg: tuple[float, ...] = ()
+    """Full angle of the beam of each sensor (degrees), NaN where it is not known; empty: of none."""
+    calibrated: bool = False
+    evened: Float32 | None = None
+    """(n,) intensity with the gains of lasers alone; None: as `intensity`."""
+
+    def __len__(self) -> int:
+        return int(self.x_m.size)
+
+    @property
+    def range_m(self) -> Float64:
+        """Returns the distance (n,) from the sensor to the return (m)."""
+        return self.ranges_m(slice(None))
+
+    def ranges_m(self, rows: npt.NDArray[np.integer[Any]] | slice) -> Float64:
+        """Returns the distance (k,) from the sensor to some returns (m)."""
+        away = self.x_m[rows] - self.sensor_x_m[rows], self.y_m[rows] - self.sensor_y_m[rows]
+        return np.sqrt(away[0] ** 2 + away[1] ** 2 + (self.height_m[rows] - self.sensor_height_m[rows]) ** 2)
+
+    @property
+    def light(self) -> Float32:
+        """Returns the light (n,) that came back, lasers made alike; it still falls with range and incidence."""
+        return self.intensity if self.evened is None else self.evened
+
+    def half_beam_rad(self, rows: npt.NDArray[np.integer[Any]]) -> Float64:
+        """Returns half the angle (n,) of the beams of some returns (rad); NaN where it is not known."""
+        known = np.full(256, np.nan)
+        known[: len(self.divergence_deg)] = np.radians(self.divergence_deg) / 2.0
+        return np.asarray(known[self.sensor[rows]])
+
+    def at(self, rows: Bool | npt.NDArray[np.integer[Any]]) -> Self:
+        """Returns the returns at `rows`, a mask (n,) or indices."""
+        arrays: dict[str, Any] = {
+            f.name: v[rows] for f in fields(self) if isinstance(v := getattr(self, f.name), np.ndarray)
+        }
+        return replace(self, **arrays)
+
+
+Values = npt.NDArray[np.floating[Any]]
+
+_NODES: Final = 65
+"""A sample stores its values as so many quantiles, from which those of all samples follow to about a hundredth."""
+
+
+class Measured(NamedTuple):
+    """Values of a statistic in one scene."""
+
+    share: float
+    """The statistic is the quantile of this share."""
+    quantiles: tuple[float, ...]
+    """Quantiles of the values at even shares."""
+    number: int
+
+
+class Statistics:
+    """Statistics by name. One that the survey does not give is measured in the scene that asks for it.
+
+    A scene's own noise or brightness would make its results depend on how squares are cut: so samples of the survey are
+    measured, and every square is searched by what all of them tell together.
+    """
+
+    def __init__(self, known: Mapping[str, float] | None = None) -> None:
+        self._known: dict[str, float] = dict(known or {})
+        self.measured: dict[str, Measured] = {}
+        """What scenes measured since."""
+        self._own: dict[str, float] = {}
+
+    def known(self, name: str) -> float | None:
+        """Returns a statistic of the survey; None where it gives none."""
+        return self._known.get(name)
+
+    def of(self, name: str, share: float, values: Callable[[], Values]) -> float | None:
+        """Returns a statistic: a quantile of values (n,), which are asked for where the survey does not give it."""
+        if name in self._known:
+            return self._known[name]
+        if name not in self._own:
+            found = values()
+            if not found.size:
+                return None
+            nodes = np.quantile(found, np.linspace(0.0, 1.0, _NODES)).tolist()
+            self.measured[name] = Measured(share, tuple(nodes), int(found.size))
+            self._own[name] = float(np.quantile(found, share))
+        return self._own[name]
+
+
+def together(measured: Iterable[Mapping[str, Measured]]) -> dict[str, tuple[float, int]]:
+    """Returns each statistic over all values of the samples, and how many samples tell it."""
+    found: dict[str, list[Measured]] = {}
+    for one in measured:
+        for name, value in one.items():
+            found.setdefault(name, []).append(value)
+    return {name: (_quantile(some), len(some)) for name, some in sorted(found.items())}
+
+
+def _quantile(some: list[Measured]) -> float:
+    values = np.concatenate([one.quantiles for one in some])
+    weights = np.repeat([one.number for one in some], _NODES)
+    return weighted_quantile(values, weights, some[0].share)
+
 
 _AROUND_M, _STEP_M = 2.0, 3.0  # Margin around the returns, and step of the extent (m).
 
@@ -27,7 +161,7 @@ class Box(NamedTuple):
     x_max_m: float
     y_max_m: float
 
-    def holds(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    def holds(self, x_m: npt.ArrayLike, y_m: npt.ArrayLike) -> Bool:
         """Returns a mask of the points (any shape) in the rectangle."""
         x, y = np.asarray(x_m), np.asarray(y_m)
         return (x >= self.x_min_m) & (x < self.x_max_m) & (y >= self.y_min_m) & (y < self.y_max_m)
@@ -63,7 +197,7 @@ class GroundModel:
     cell_m: float
     height_m: Float32
     """(rows, columns) height at the middle of each cell; NaN where none is known near."""
-    seen: npt.NDArray[np.bool_]
+    seen: Bool
     """(rows, columns) True where ground was seen; elsewhere the height is interpolated between seen cells."""
     sigma_m: Float32 | None = None
     """(rows, columns) 1 σ of the heights (m): the noise of returns where ground was seen, more with the distance from
@@ -109,3 +243,31 @@ class Scene:
         Rasters are made over it; a window without returns is its own extent.
         """
         return extent_of(self.window, self.returns)
+
+
+Find = TypeVar("Find", bound=Callable[..., Any])
+
+
+def once_a_tile(find: Find) -> Find:
+    """Returns the same function of a scene and options, which is computed once while the scene is in memory."""
+    known: weakref.WeakKeyDictionary[Scene, dict[object, Any]] = weakref.WeakKeyDictionary()
+
+    @functools.wraps(find)
+    def remembered(scene: Scene, *options: object) -> Any:
+        found = known.setdefault(scene, {})
+        if options not in found:
+            found[options] = find(scene, *options)
+        return found[options]
+
+    return cast(Find, remembered)
+
+
+def once_a_scene(find: Find) -> Find:
+    """Returns the same function, which is computed once for all tiles of a scene together."""
+    remembered = once_a_tile(find)
+
+    @functools.wraps(find)
+    def of_whole(scene: Scene, *options: object) -> Any:
+        return remembered(scene if scene.whole is None else scene.whole, *options)
+
+    return cast(Find, of_whole)

@@ -2,14 +2,67 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal, Self
+from pathlib import Path
+from typing import Any, ClassVar, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
-from roadscan.assets.ground.settings import GroundSettings
-from roadscan.assets.pictures.settings import AssetPicturesSettings
 from roadscan.core.strict import Strict
 from roadscan.core.survey import SurveySection
+from roadscan.pictures.views import PictureRule
+
+_LARGEST_HOLE_M: Final = 10.0
+"""Across holes that reach farther from seen ground (m), heights depend little on ground that lies farther away."""
+
+
+class GroundSettings(Strict):
+    """How returns on bare earth are told from all others."""
+
+    method: Literal["morphological", "planes"] = "morphological"
+    """The filter: "morphological" opens the surface of lowest returns with growing windows; "planes" fits planes to
+    the returns again and again (RANSAC), each to what the planes before left over."""
+    cell_m: float = Field(default=0.25, ge=0.05, le=2.0)
+    """Edge of a cell of the bare-earth raster (m)."""
+    steepest: float = Field(default=0.15, gt=0.0, le=1.0)
+    """Slope of the terrain above which a step over a window's width counts as an object's (m/m)."""
+    largest_object_m: float = Field(default=18.0, gt=0.0, le=100.0)
+    """Greatest half-width of an object that stands on the ground (m)."""
+    reach_m: float = Field(default=10.0, ge=0.0, le=1000.0)
+    """How far from ground that was seen its height is interpolated; beyond, it is not known (m)."""
+
+    @property
+    def depends_on_m(self) -> float:
+        """Returns how far away a return can change the ground at a place (m).
+
+        An opening looks at disks that hold the place, and at all of each: twice the half-width of the largest object.
+        The height of a hole depends on ground that was seen around it.
+        """
+        return 2.0 * self.largest_object_m + min(self.reach_m, _LARGEST_HOLE_M)
+
+
+class AssetPicturesSettings(Strict):
+    """Which pictures show assets, and what is looked for in them."""
+
+    on: bool = True
+    """Name the pictures that show each asset best, and look at them. Without cameras nothing is named."""
+    cameras: list[str] = []
+    """Cameras of the rig whose pictures count; all of them where empty."""
+    reach_m: float = Field(default=40.0, gt=1.0, le=200.0)
+    """Farthest distance from a camera to an asset (m)."""
+    most: int = Field(default=3, ge=1, le=10)
+    """How many pictures are named for an asset, at most."""
+    cut_outs: bool = True
+    """Keep the part of each of these pictures that shows a sign, as a JPEG file."""
+    margin: float = Field(default=0.25, ge=0.0, le=2.0)
+    """How far a cut-out reaches beyond the sign on each side, as a share of its size."""
+    text: bool = False
+    """Read the text on signs; needs the extra `ocr` (pip install "roadscan[ocr]")."""
+    sign_types: Literal["both", "vienna", "mutcd", "off"] = "both"
+    """Tell the types of signs with the recogniser that comes with roadscan: of the set that the country has, of both
+    sets, or not at all. docs/assets.md lists the types."""
+    recogniser: Path | None = None
+    """ONNX model of your own that tells the type of a sign from its cut-out; needs the extra `onnx`. It goes before the
+    recogniser that comes with roadscan. docs/assets.md says what it gets and gives."""
 
 
 class GroundSectionsConfig(Strict):
@@ -78,3 +131,12 @@ class AssetsConfig(SurveySection):
         if self.cross_sections is not None and not self.bare_earth:
             raise ValueError("cross_sections are made of bare earth: bare_earth = false leaves them without it")
         return self
+
+
+_ANY_ANGLE_DEG: Final = -90.0  # Least angle below the horizon: any (degrees).
+_BORDER_PX: Final = 1  # Border of a picture that is not used (pixels).
+
+
+def picture_rule(settings: AssetPicturesSettings) -> PictureRule:
+    """Returns the rule: pictures of the cameras that are asked for, within reach, at any angle."""
+    return PictureRule(tuple(settings.cameras), settings.reach_m, _ANY_ANGLE_DEG, _BORDER_PX)

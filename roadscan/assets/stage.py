@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from roadscan.assets.kind import AssetKind
 from roadscan.assets.kinds.lane_line import LaneLine
-from roadscan.assets.paint.contrast import ROUGHEST_M
+from roadscan.assets.paint.components import ROUGHEST_M
 from roadscan.core.errors import RoadscanError
 from roadscan.core.extras import need
 from roadscan.core.survey import Survey
@@ -139,9 +139,16 @@ class Assets(Stage):
         return pictures
 
     def _write(self, session: Session, plan: AssetPlan, pictures: PicturePlan) -> None:
-        from roadscan.assets.tasks.drives import drives_key, load_drives
         from roadscan.assets.tasks.sections import SECTIONS, plan_sections, write_sections
-        from roadscan.assets.tasks.tables import TABLES, plan_files, plan_tables, write_file, write_table
+        from roadscan.assets.tasks.tables import (
+            TABLES,
+            drives_key,
+            load_drives,
+            plan_files,
+            plan_tables,
+            write_file,
+            write_table,
+        )
         from roadscan.condition.tasks.lines import survey_roads
 
         manifest, context = session.manifest, plan.context
@@ -220,10 +227,9 @@ class Assets(Stage):
         return state
 
     def _files_due(self, session: Session, plan: AssetPlan) -> int:
-        from roadscan.assets.tasks.drives import drives_key
         from roadscan.assets.tasks.picture_work import plan_asset_pictures
         from roadscan.assets.tasks.sections import SECTIONS, plan_sections
-        from roadscan.assets.tasks.tables import TABLES, plan_files, plan_tables
+        from roadscan.assets.tasks.tables import TABLES, drives_key, plan_files, plan_tables
         from roadscan.condition.tasks.lines import roads_key, survey_roads
 
         manifest, context = session.manifest, plan.context

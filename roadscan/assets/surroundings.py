@@ -1,30 +1,134 @@
-"""Classes of stationary things beside and over the road: vegetation, buildings, wires, noise."""
+"""Classes of stationary things beside and over the road, from the scatter of returns in cubes above the ground."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets import classes
-from roadscan.assets.cubes import EDGE_M, Cubes
-from roadscan.assets.ground.grid import Grid, grid_over
-from roadscan.assets.kernels import voxels
-from roadscan.assets.kernels.standing_classes import ALONE, LEAFY, WALL, WIRE, standing_classes
-from roadscan.assets.overheads import overhead_classes
-from roadscan.assets.returns import Returns
-from roadscan.assets.scene import Box
-from roadscan.compute.array_types import Float32
+from roadscan.assets.ground.surface import Grid, grid_over
+from roadscan.assets.kernels import cubes
+from roadscan.assets.kernels import cubes as voxels
+from roadscan.assets.kernels.columns import mark_corridor
+from roadscan.assets.kernels.cubes import ALONE, LEAFY, WALL, WIRE, standing_classes
+from roadscan.assets.scene import Box, Returns
+from roadscan.compute.array_types import Bool, Float32
 from roadscan.compute.kernel_options import read_only
 from roadscan.core.extras import cv2
 
-Bools = npt.NDArray[np.bool_]
+EDGE_M: Final = 0.3
+"""Edge of a cube (m); features are those of three by three by three cubes."""
+LAYERS: Final = 64
+"""Cubes above one another: up to 19 m above the ground."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cubes:
+    """Cubes that contain returns."""
+
+    number: npt.NDArray[np.int32]
+    """(n,) number of each return's cube, -1 for none."""
+    place: npt.NDArray[np.int32]
+    """(cubes, 3) row, column and layer from the window's corner and the ground."""
+    features: npt.NDArray[np.float32]
+    """(cubes, 7), columns as in :mod:`roadscan.assets.kernels.cubes`."""
+
+    def of_returns(self, column: int, otherwise: float = np.nan) -> npt.NDArray[np.float32]:
+        """Returns a feature (n,) of each return's cube."""
+        values = np.append(self.features[:, column], np.float32(otherwise))
+        return np.asarray(values[self.number])
+
+
+def cubes_of(returns: Returns, above_m: npt.NDArray[np.float32], chosen: Bool, window: Box) -> Cubes:
+    """Returns the cubes of the chosen returns (n,), with the scatter in each cube and its neighbours."""
+    grid = grid_over(window, EDGE_M)
+    index = np.full((*grid.shape, LAYERS), -1, np.int32)
+    number = np.empty(len(returns), np.int32)
+    place = np.empty((int(np.count_nonzero(chosen)), 3), np.int32)
+    per_m = 1.0 / EDGE_M
+    count = cubes.numbered(returns.x_m, returns.y_m, above_m, chosen, grid.origin, per_m, index, number, place)
+    place = place[:count].copy()
+    sums = np.zeros((count, cubes.MOMENTS))
+    cubes.moments(returns.x_m, returns.y_m, above_m, number, grid.origin, per_m, place, sums)
+    features = np.empty((count, 7), np.float32)
+    cubes.features(index, place, sums, features)
+    return Cubes(number, place, features)
+
+
+_LOWEST_M: Final = 2.5
+"""Least height of a structure over the path (m)."""
+_CORRIDOR_M: Final = 1.5
+"""Half width of the corridor of a drive (m)."""
+_LEAST_CELLS: Final = 4
+"""Least number of cells of the corridor under a structure."""
+_PLANAR: Final = 0.4  # Least planarity of a cube of a deck or of a wall.
+_UPRIGHT: Final = 0.25  # Least upward part of the normal of a deck, greatest of that of a wall.
+_BELOW_CUBES, _ABOVE_CUBES = 1, 4
+"""Edges and parapets of a deck reach this far below and above its level cubes (cubes)."""
+_DECK_CELLS: Final = 7
+"""Least extent of a deck's lower face in both directions (cells of 0.3 m): that of a gantry is less."""
+
+
+def overhead_classes(
+    cubes: Cubes, grid: Grid, leafy: Bool, left_out: Bool, drive_xyh_m: npt.NDArray[np.float64]
+) -> npt.NDArray[np.uint8]:
+    """Returns the class (cubes,) of each cube: bridge deck, overhead structure, or 0 for neither.
+
+    What hangs together 2.5 m above the ground or higher, seen from above, is a structure over the way where a drive
+    passes beneath it. It is a bridge deck where it holds a level plane of 2.1 m by 2.1 m above that drive; its edges
+    scatter in all directions as leaves do, and belong to it.
+
+    Parameters
+    ----------
+    leafy : (cubes,) those that scatter as leaves do; left_out : (cubes,) those that are wires or walls.
+    drive_xyh_m : (p, 4) x, y and height of the sensor (m) and the pass.
+    """
+    out = np.zeros(left_out.size, np.uint8)
+    high = ~left_out & (cubes.place[:, 2] * EDGE_M >= _LOWEST_M)
+    corridor = _corridors(grid, drive_xyh_m)
+    row, column, layer = cubes.place.T
+    if not (high & corridor[row, column]).any():
+        return out
+    level = high & (cubes.features[:, voxels.PLANARITY] >= _PLANAR)
+    level &= cubes.features[:, voxels.NORMAL_UP] > _UPRIGHT
+    hanging = (high & ~leafy) | level
+    cells = np.zeros(grid.shape, np.uint8)
+    cells[row[hanging], column[hanging]] = 1
+    count, label = cv2.connectedComponents(cv2.morphologyEx(cells, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)))
+    over = np.bincount(label[corridor & (cells > 0)], minlength=count) >= _LEAST_CELLS
+    over[0] = False
+    faces = np.zeros(grid.shape, np.uint8)
+    faces[row[level], column[level]] = 1
+    faces = cv2.morphologyEx(faces, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    wide = cv2.morphologyEx(faces, cv2.MORPH_OPEN, np.ones((_DECK_CELLS, _DECK_CELLS), np.uint8)) > 0
+    decks = np.bincount(label[wide & corridor], minlength=count) > 0
+    own = label[row, column]
+    out[high & ~leafy & over[own]] = classes.OVERHEAD_STRUCTURE
+    for number in np.flatnonzero(over & decks).tolist():
+        about = cv2.dilate((label == number).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        layers = layer[level & (own == number)]
+        near = high & (layer >= layers.min() - _BELOW_CUBES) & (layer <= layers.max() + _ABOVE_CUBES)
+        out[near & about[row, column]] = classes.BRIDGE_DECK
+    return out
+
+
+def _corridors(grid: Grid, drive_xyh_m: npt.NDArray[np.float64]) -> Bool:
+    """Returns a mask of cells (rows, columns) near the drives."""
+    inside = np.zeros(grid.shape, np.bool_)
+    for number in np.unique(drive_xyh_m[:, 3]).tolist():
+        drive = drive_xyh_m[drive_xyh_m[:, 3] == number]
+        x, y = np.ascontiguousarray(drive[:, 0]), np.ascontiguousarray(drive[:, 1])
+        mark_corridor(x, y, _CORRIDOR_M, np.array(grid.origin), EDGE_M, inside)
+    return inside
+
 
 REACH_M: Final = 8.0
 """A roof of 6 m, with the cubes around that tell its scatter, lies within this (m)."""
-_PLANAR, _UPRIGHT, _THICK = 0.4, 0.25, 0.4
-"""A cube is part of an upright plane with at least this planarity, at most this upward part of its normal, and at most
+_THICK: Final = 0.4
+"""A cube is part of an upright plane with at least that planarity, at most that upward part of its normal, and at most
 this thickness (cubes)."""
 _WALL_CUBES, _WALL_M, _WALL_LENGTH_M = 2, 1.5, 4.0
 """Least number of such cubes of a wall above one another, also half of all there, its least height and length (m)."""
@@ -84,7 +188,7 @@ def surroundings(
     return out
 
 
-def leaves(cubes: Cubes, grid: Grid) -> Bools:
+def leaves(cubes: Cubes, grid: Grid) -> Bool:
     """Returns a mask (cubes,) of those in columns that scatter in all directions, with those around."""
     row, column = cubes.place[:, 0], cubes.place[:, 1]
     number, scattering = np.zeros(grid.shape), np.zeros(grid.shape)
@@ -96,7 +200,7 @@ def leaves(cubes: Cubes, grid: Grid) -> Bools:
     return np.asarray((sums[1] >= _LEAFY * sums[0])[row, column])
 
 
-def walls_and_roofs(cubes: Cubes, grid: Grid) -> tuple[Bools, Bools]:
+def walls_and_roofs(cubes: Cubes, grid: Grid) -> tuple[Bool, Bool]:
     """Returns masks (cubes,) of walls, the large upright planes, and of roofs: other large planes, above a person."""
     place, features = cubes.place, cubes.features
     row, column = place[:, 0], place[:, 1]
@@ -119,7 +223,7 @@ def walls_and_roofs(cubes: Cubes, grid: Grid) -> tuple[Bools, Bools]:
     return np.asarray(walls[row, column]), np.asarray(roofs[row, column] & roof)
 
 
-def long_ones(cells: Bools, least_m: float) -> Bools:
+def long_ones(cells: Bool, least_m: float) -> Bool:
     """Returns a mask (rows, columns) of groups of cells, a cell wider, that are no shorter than `least_m`."""
     wider = cv2.dilate(cells.view(np.uint8), np.ones((3, 3), np.uint8))
     count, label, boxes, _ = cv2.connectedComponentsWithStats(wider, connectivity=8)
@@ -131,7 +235,7 @@ def long_ones(cells: Bools, least_m: float) -> Bools:
     return np.asarray(around > 0)
 
 
-def wires(cubes: Cubes, grid: Grid) -> Bools:
+def wires(cubes: Cubes, grid: Grid) -> Bool:
     """Returns a mask (cubes,) of wires: linear, level and high, with nothing else in their columns above a person."""
     place, features = cubes.place, cubes.features
     row, column = place[:, 0], place[:, 1]

@@ -15,8 +15,8 @@ import numpy.typing as npt
 import pyarrow as pa
 import shapely
 
-from roadscan.assets.object_table import object_names
-from roadscan.assets.tasks.along_roads import along_roads
+from roadscan.assets.kind import object_names
+from roadscan.assets.tasks.tables import along_roads
 from roadscan.assets.visibility import BANDS_M, PASSES
 from roadscan.compute.array_types import Float64, Int64
 from roadscan.condition.tasks.lines import survey_roads

@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 
 from roadscan.assets.kind import AssetKind
 from roadscan.assets.settings import AssetsConfig
-from roadscan.assets.tasks.kinds import wanted_kinds
+from roadscan.assets.tasks.plan import wanted_kinds
 from roadscan.core.counted import counted, size_in_words
 from roadscan.core.errors import RoadscanError
 from roadscan.core.survey import Survey

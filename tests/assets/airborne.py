@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.assets.returns import Returns
+from roadscan.assets.scene import Returns
 
 
 def airborne(points: npt.NDArray[np.float64]) -> Returns:

@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 from shapely.ops import substring
 
 from roadscan.assets.make_scene import make_scene
-from roadscan.assets.returns import Returns
-from roadscan.assets.scene import Box, Scene
+from roadscan.assets.scene import Box, Returns, Scene
 from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, leap_seconds_at_unix
 from tests.assets.scenes import joined, recordings_folder
 

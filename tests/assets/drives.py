@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import small_gicp
 
-from roadscan.assets.returns import Returns
+from roadscan.assets.scene import Returns
 from tests.assets.scenes import joined, recordings_folder, velodyne_returns
 
 IMU_TO_VELODYNE: Final = np.array(

@@ -12,8 +12,7 @@ import numpy.typing as npt
 import pytest
 
 from roadscan.assets.make_scene import make_scene
-from roadscan.assets.returns import Returns
-from roadscan.assets.scene import Box, Scene
+from roadscan.assets.scene import Box, Returns, Scene
 from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, leap_seconds_at_unix
 
 REPOSITORY = Path(__file__).resolve().parents[2]

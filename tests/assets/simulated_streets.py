@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.make_scene import make_scene
-from roadscan.assets.returns import Returns
-from roadscan.assets.scene import Box, Scene
+from roadscan.assets.scene import Box, Returns, Scene
 from roadscan.simulate.caster import World, ray_key
 from roadscan.simulate.drive import Drive, drives_of
 from roadscan.simulate.lidar_model import lidar_model

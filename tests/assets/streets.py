@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.assets.returns import Returns
+from roadscan.assets.scene import Returns
 from roadscan.simulate import Scene
 from roadscan.simulate.caster import World
 from roadscan.simulate.drive import drives_of

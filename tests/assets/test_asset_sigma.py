@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from roadscan.assets.tasks.drives import Drives
+from roadscan.assets.tasks.tables import Drives
 from roadscan.simulate import Scene, simulate
 from tests.assets.posts import Posts, only_kinds
 from tests.assets.test_assets import run, session

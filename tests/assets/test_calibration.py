@@ -7,8 +7,8 @@ import pytest
 
 from benchmarks.asset_scores import Judged
 from benchmarks.bench_asset_probability import fitted
-from roadscan.assets.calibration import CURVES, Curve, curve_named
 from roadscan.assets.kind import AssetKind, asset_kinds
+from roadscan.assets.probabilities import CURVES, Curve, curve_named
 
 
 def test_each_kind_has_a_curve_and_others_none() -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from roadscan.assets.ground.cross_sections import cross_sections, stations
 from roadscan.assets.scene import GroundModel
+from roadscan.assets.tasks.sections import cross_sections, stations
 
 
 def tilted(x_min_m: float = 0.0, seen: bool = True) -> GroundModel:

@@ -7,10 +7,9 @@ from typing import Any, cast
 
 import numpy as np
 
-from roadscan.assets.ground.grid import Grid
-from roadscan.assets.ground.islands import without_islands
-from roadscan.assets.ground.settings import GroundSettings
-from roadscan.assets.ground.surface import Place, Surface
+from roadscan.assets.ground.dense import without_islands
+from roadscan.assets.ground.surface import Grid, Place, Surface
+from roadscan.assets.settings import GroundSettings
 
 GRID = Grid(0.0, 0.0, 0.25, 80, 80)
 

@@ -14,8 +14,7 @@ import shapely
 
 from roadscan.assets.intensity import calibrated_scene, gains_of, intensity_sample
 from roadscan.assets.kind import AssetObject, Evidence, asset_kinds
-from roadscan.assets.paint.components import Component
-from roadscan.assets.paint.contrast import Contrast
+from roadscan.assets.paint.components import Component, Contrast
 from roadscan.assets.paint.stripes import stripes_of
 from roadscan.assets.scene import Box, Scene
 from roadscan.simulate.scene import Scene as SimulatedScene

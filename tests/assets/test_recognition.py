@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from roadscan.assets.pictures.reader import CutOut
-from roadscan.assets.pictures.settings import AssetPicturesSettings
+from roadscan.assets.settings import AssetPicturesSettings
 from roadscan.assets.tasks.recognition import OnnxModel, SignRecognition, check_recognition, recognition_of, upright
 from roadscan.core.errors import ConfigError
 

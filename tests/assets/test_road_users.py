@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from roadscan.assets import classes
-from roadscan.assets.ground.grid import Grid
+from roadscan.assets.ground.surface import Grid
 from roadscan.assets.kind import asset_kinds
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.moving import Columns, load_levels, moving_cells

@@ -12,8 +12,7 @@ from benchmarks.sign_faces import FACES
 from benchmarks.sign_renders import HELD_OUT, UNLISTED, face_drawing, seen
 from roadscan.assets.pictures import sign_types as module
 from roadscan.assets.pictures.reader import CutOut
-from roadscan.assets.pictures.sign_features import COUNT, features_of
-from roadscan.assets.pictures.sign_types import MOST_HIDDEN, UNKNOWN, listed_types, sign_types
+from roadscan.assets.pictures.sign_types import COUNT, MOST_HIDDEN, UNKNOWN, features_of, listed_types, sign_types
 from roadscan.assets.tasks.pictures import _cut_out
 from roadscan.core.errors import RoadscanError
 from tests.assets.scenes import recordings_folder

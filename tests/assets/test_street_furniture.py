@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.assets.furniture.compact import compact_things
-from roadscan.assets.kinds.street_furniture import JUDGES, StreetFurniture
+from roadscan.assets.kinds.street_furniture import JUDGES, StreetFurniture, compact_things
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.scene import Box
 from roadscan.simulate.scene import Scene as StreetScene

@@ -5,11 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from roadscan.assets import classes
-from roadscan.assets.cubes import cubes_of
-from roadscan.assets.ground.road import road_cells
-from roadscan.assets.returns import Returns
-from roadscan.assets.scene import Box, GroundModel
-from roadscan.assets.surroundings import surroundings
+from roadscan.assets.ground.bare_earth import road_cells
+from roadscan.assets.scene import Box, GroundModel, Returns
+from roadscan.assets.surroundings import cubes_of, surroundings
 from tests.assets.scenes import semantic_kitti_scene
 from tests.assets.test_bare_earth import airborne, iou
 

@@ -7,8 +7,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pytest
 
-from roadscan.assets.returns import Returns
-from roadscan.assets.scene import Box, GroundModel, Scene
+from roadscan.assets.scene import Box, GroundModel, Returns, Scene
 from roadscan.assets.visibility import CELL_M, PASSES, in_sight, passes_in_sight
 
 CORNER = (691_000.0, 5_334_000.0)

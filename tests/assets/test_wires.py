@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import shapely
 
+from roadscan.assets.kernels.cubes import lines_through
 from roadscan.assets.kind import AssetObject
 from roadscan.assets.kinds.wire import Wire
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.scene import Box
-from roadscan.assets.wires.kernels.lines_through import lines_through
 from roadscan.simulate.scene import Scene as StreetScene
 from tests.assets.streets import Street, street
 

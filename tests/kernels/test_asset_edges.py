@@ -8,19 +8,25 @@ import numpy as np
 import pytest
 
 from roadscan.assets.kernels.edge_links import MAX_LINKS, best_ways, find_links, trace
-from roadscan.assets.kernels.low_heights import low_heights
+from roadscan.assets.kernels.low_returns import low_heights
 from roadscan.assets.kernels.step_filter import CHUNK, FRAME, WORK, step_response, strips, thin
-from roadscan.assets.kernels.step_profiles import FACE, OFFSET, RESULTS, SIGMA_STEP, STEP, TOP, fit_nodes
-from roadscan.assets.kernels.transects import (
+from roadscan.assets.kernels.step_profiles import (
     END,
+    FACE,
     OBSTACLE,
+    OFFSET,
+    RESULTS,
+    SIGMA_STEP,
     SLOPE,
+    STEP,
     STEP_DOWN,
+    TOP,
+    TRANSECT_RESULTS,
     UNSEEN,
     WIDTH,
+    fit_nodes,
     walk,
 )
-from roadscan.assets.kernels.transects import RESULTS as WALK_RESULTS
 from roadscan.compute.kernels.edge_across import best_path, step_and_bend
 
 RNG = np.random.default_rng(8)
@@ -172,7 +178,7 @@ def test_a_walk_ends_at_what_stands_and_at_an_edge() -> None:
     edge_x[1, 25] = -1.0
     height[2, 40:] = np.nan
     node = np.array([[0.05, 0.05 + 0.1 * r, 1.0, 0.0] for r in range(3)])
-    out = np.empty((3, WALK_RESULTS))
+    out = np.empty((3, TRANSECT_RESULTS))
     walk(node, height, rough, blocked, edge_x, edge_y, (0.0, 0.0, 0.1), (0.3, 5.0, 0.8, 0.15, 0.03), out)
     assert out[:, END].tolist() == [OBSTACLE, STEP_DOWN, UNSEEN]
     assert out[:, WIDTH] == pytest.approx([3.4, 2.5, 3.9], abs=0.11)

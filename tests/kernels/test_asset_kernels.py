@@ -7,14 +7,11 @@ import pytest
 from scipy.interpolate import RegularGridInterpolator
 from scipy.stats import binned_statistic_2d
 
-from roadscan.assets.kernels import voxels
+from roadscan.assets.kernels import cubes
 from roadscan.assets.kernels.columns import columns, distinct, marked, straight_run, tops
-from roadscan.assets.kernels.filling import begin, halved, relax
-from roadscan.assets.kernels.ground_cells import cell_heights, on_ground, scatter
-from roadscan.assets.kernels.heights import heights_above
-from roadscan.assets.kernels.lowest import counts, lowest_returns
-from roadscan.assets.kernels.planes import planes
-from roadscan.assets.kernels.voxels import features, moments, numbered
+from roadscan.assets.kernels.cubes import features, moments, numbered
+from roadscan.assets.kernels.ground import begin, cell_heights, halved, on_ground, planes, relax, scatter
+from roadscan.assets.kernels.low_returns import counts, heights_above, lowest_returns
 
 ORIGIN = np.array([2.0, -3.0])
 ROWS, COLUMNS, CELL_M = 6, 8, 0.5
@@ -176,7 +173,7 @@ def test_features_of_cubes_are_those_of_the_covariance_of_27_cubes() -> None:
     index = np.full((12, 12, 12), -1, np.int32)
     number, place = np.empty(x.size, np.int32), np.empty((x.size, 3), np.int32)
     count = numbered(x, y, above, np.ones(x.size, np.bool_), origin, 1 / edge, index, number, place)
-    sums, found = np.zeros((count, voxels.MOMENTS)), np.empty((count, 7), np.float32)
+    sums, found = np.zeros((count, cubes.MOMENTS)), np.empty((count, 7), np.float32)
     moments(x, y, above, number, origin, 1 / edge, place[:count], sums)
     features(index, place[:count], sums, found)
     cube = np.floor(np.stack([y - origin[1], x - origin[0], above.astype(float)]) / edge).astype(int)
@@ -185,14 +182,14 @@ def test_features_of_cubes_are_those_of_the_covariance_of_27_cubes() -> None:
         near = (np.abs(cube - place[k][:, None]) <= 1).all(axis=0)
         values, vectors = np.linalg.eigh(np.cov(np.stack([x, y, above])[:, near] / edge, bias=True))
         third, second, first = np.sqrt(np.maximum(values, 0.0))
-        assert found[k, voxels.NUMBER] == near.sum()
+        assert found[k, cubes.NUMBER] == near.sum()
         expected = [(first - second) / first, (second - third) / first, third / first]
         np.testing.assert_allclose(found[k, 1:4], expected, atol=1e-4)
-        assert found[k, voxels.THICKNESS] == pytest.approx(third, abs=1e-4)
+        assert found[k, cubes.THICKNESS] == pytest.approx(third, abs=1e-4)
         if second - third > 0.05:
-            assert found[k, voxels.NORMAL_UP] == pytest.approx(abs(vectors[2, 0]), abs=1e-3)
+            assert found[k, cubes.NORMAL_UP] == pytest.approx(abs(vectors[2, 0]), abs=1e-3)
         if first - second > 0.05:
-            assert found[k, voxels.ALONG_UP] == pytest.approx(abs(vectors[2, 2]), abs=1e-3)
+            assert found[k, cubes.ALONG_UP] == pytest.approx(abs(vectors[2, 2]), abs=1e-3)
 
 
 def test_repeated_planes_hold_a_road_and_its_bank_and_leave_the_rest_over() -> None:

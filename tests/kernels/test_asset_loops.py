@@ -8,8 +8,9 @@ import scipy.ndimage
 
 from roadscan.assets.kernels.beams import ground_heights, log_gains, meet_ground
 from roadscan.assets.kernels.buckets import by_number, raster_cells, rows_within
-from roadscan.assets.kernels.corridors import mark_strip
-from roadscan.assets.kernels.ground_cells import least_over_disk
+from roadscan.assets.kernels.columns import mark_strip
+from roadscan.assets.kernels.cubes import ALONE, LEAFY, WALL, WIRE, standing_classes
+from roadscan.assets.kernels.ground import least_over_disk
 from roadscan.assets.kernels.paint_levels import (
     contrasts,
     distinct_in_groups,
@@ -17,9 +18,7 @@ from roadscan.assets.kernels.paint_levels import (
     scan_lines,
     seen_on_ground,
 )
-from roadscan.assets.kernels.smoothing import convolve, window_means
-from roadscan.assets.kernels.standing_classes import ALONE, LEAFY, WALL, WIRE, standing_classes
-from roadscan.assets.kernels.step_filter import sizes_of, take_excess
+from roadscan.assets.kernels.step_filter import convolve, sizes_of, take_excess, window_means
 from roadscan.compute.kernel_options import read_only
 
 RNG = np.random.default_rng(23)

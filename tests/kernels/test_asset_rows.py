@@ -12,13 +12,11 @@ from scipy.spatial import cKDTree
 
 from roadscan.assets import classes
 from roadscan.assets.bins import cells_of, in_bins
-from roadscan.assets.covers.kernels.grown import grow_spot
-from roadscan.assets.ground.kernels.breaks import drops_on_both_sides, grow
-from roadscan.assets.judgement.kernels.boosted_trees import tree_sums
+from roadscan.assets.kernels.boosted_trees import tree_sums
 from roadscan.assets.kernels.buckets import sort_groups
-from roadscan.assets.kernels.filling import relax
-from roadscan.assets.upright.kernels.about_shaft import Part, about_shaft
-from roadscan.assets.upright.kernels.shafts import longest_run, near_axis, returns_about, widths_of_levels
+from roadscan.assets.kernels.ground import drops_on_both_sides, grow, relax
+from roadscan.assets.kernels.shafts import Part, about_shaft, longest_run, near_axis, returns_about, widths_of_levels
+from roadscan.assets.kernels.spots import grow_spot
 
 
 def test_each_row_gets_the_leaves_that_it_reaches() -> None:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from roadscan.assets.kernels.buckets import count_buckets, fill_buckets
-from roadscan.assets.kernels.corridors import mark_corridor
-from roadscan.assets.kernels.cylinders import fit_cylinder, radius_across
-from roadscan.assets.kernels.grown_cells import low_moments
-from roadscan.assets.kernels.slices import fill_slices, slices_above_one_another
+from roadscan.assets.kernels.columns import mark_corridor
+from roadscan.assets.kernels.low_returns import low_moments
+from roadscan.assets.kernels.shafts import fill_slices, fit_cylinder, radius_across, slices_above_one_another
 from roadscan.assets.kernels.upright_voxels import (
     beside_line,
     gather_moments,

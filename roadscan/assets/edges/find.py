@@ -1,24 +1,28 @@
-"""Steps along the road of a scene: paths cut where no step is measurable, and bridged where it is hidden or lowered."""
+"""Steps along the road of a scene as paths, the features of their nodes, and which of them are kerbs.
+
+A judge tells kerbs by features of what is seen around the nodes, which depend on no scanner and no site.
+Heights of steps, their scatter, bends, ranges, densities and distances from the drive tell streets and scanners apart,
+not kerbs; without them it judges unseen ones better.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import scipy.ndimage
 import scipy.spatial
 
+from roadscan.assets import classes
 from roadscan.assets.edges import profiles
-from roadscan.assets.edges.paths import paths_of
-from roadscan.assets.edges.profiles import NODE_M, Heights, Nodes
-from roadscan.assets.edges.raster import HeightRaster, raster_of
-from roadscan.assets.edges.steps import step_places
-from roadscan.assets.memory import once_a_scene
-from roadscan.assets.scene import Scene
-from roadscan.compute.array_types import Float64
-
-Mask = npt.NDArray[np.bool_]
+from roadscan.assets.edges.profiles import NODE_M, Heights, Nodes, paths_of
+from roadscan.assets.edges.steps import HeightRaster, raster_of, step_places
+from roadscan.assets.judgement.judge import Judge
+from roadscan.assets.kernels.columns import mark_corridor
+from roadscan.assets.scene import Scene, once_a_scene
+from roadscan.compute.array_types import Bool, Float64
+from roadscan.core.extras import cv2
 
 
 class EdgeSettings(NamedTuple):
@@ -51,7 +55,7 @@ class Edge(NamedTuple):
     """A line of steps of one scene; the higher side lies to the right of its direction."""
 
     nodes: Nodes
-    seen: Mask
+    seen: Bool
     """(n,) nodes whose step was measured; the others bridge hidden parts."""
     evidence: float
     """Evidence (σ · m) of its places."""
@@ -93,10 +97,10 @@ def found_edges(raster: HeightRaster, heights: Heights, settings: EdgeSettings =
 def _told(nodes: Nodes, evidence: float, settings: EdgeSettings) -> list[Edge]:
     """Returns runs of nodes with a measurable step; up to two nodes without are left inside a run."""
     known = np.isfinite(nodes.sigma_step_m)
-    low, high, scatter = (_running(c, known) for c in (nodes.seen_low, nodes.seen_high_m, nodes.scatter_m))
+    low, high, scatter = (_medians_of_five(c, known) for c in (nodes.seen_low, nodes.seen_high_m, nodes.scatter_m))
     good = known & (nodes.step_m >= settings.least_step_m) & (low >= settings.seen_low)
-    good &= (high >= settings.seen_high_m) & (_running(nodes.step_m, known) >= settings.ratio * scatter)
-    good &= _running(nodes.step_m, known) <= settings.greatest_step_m
+    good &= (high >= settings.seen_high_m) & (_medians_of_five(nodes.step_m, known) >= settings.ratio * scatter)
+    good &= _medians_of_five(nodes.step_m, known) <= settings.greatest_step_m
     good &= nodes.covered >= settings.covered
     whole = scipy.ndimage.binary_closing(np.pad(good, 3), np.ones(5))[3:-3]
     number, count = scipy.ndimage.label(whole)
@@ -108,7 +112,7 @@ def _told(nodes: Nodes, evidence: float, settings: EdgeSettings) -> list[Edge]:
     return edges
 
 
-def _running(values: Float64, known: Mask) -> Float64:
+def _medians_of_five(values: Float64, known: Bool) -> Float64:
     """Returns the median (n,) of five known neighbours; 0 where nothing is known."""
     at = np.flatnonzero(known)
     if at.size == 0:
@@ -208,3 +212,182 @@ def _joined(
 
 def _chained(a: Nodes, b: Nodes) -> Nodes:
     return Nodes(*(np.concatenate([p, q]) for p, q in zip(a, b, strict=True)))
+
+
+_AROUND_NODES: Final = 7
+"""Features are medians over this many nodes (3 m): an edge is what it is over a length, not at a point."""
+_BESIDE_M: Final = 0.7  # Returns this near to a node (m) tell of its sides …
+_FACE_M: Final = 0.08  # … unless they are nearer to the edge than this (m): those are on its face.
+_STANDING_M: Final = (0.3, 2.0)
+"""Heights above the ground (m) at which fences, walls and hedges are seen."""
+_PLANTS_M: Final = (0.05, 0.3)  # Heights above the ground (m) of grass and of the lower parts of plants.
+_LONG_M: Final = 12.0  # Longer edges (m) are alike: windows cut them anywhere.
+_MOST_EVIDENCE: Final = 4.0  # Greatest evidence (σ) a metre that is told.
+_MOST_RATIO: Final = 30.0  # Greatest significance that is told: more says no more.
+_LEAST_SIGMA_M: Final = 0.004  # Error (m) of a step that the lines of its sides do not show.
+
+
+def node_features(scene: Scene, edges: Sequence[Edge]) -> dict[str, Float64]:
+    """Returns features (n,) by name of all nodes of some edges, one edge after the other; NaN where one is not known.
+
+    The measured ones are medians over 3 m of an edge.
+    """
+    nodes = [edge.nodes for edge in edges]
+    names = ("x_m", "y_m", "heading_x", "heading_y", "step_m", "sigma_step_m", "seen_low", "covered")
+    x, y, ux, uy, step, sigma, seen_low, covered = (np.concatenate([getattr(n, k) for n in nodes]) for k in names)
+    place = np.column_stack([x, y, ux, uy])
+    measured = {
+        "seen_low": seen_low, "covered": covered,
+        "significance": np.minimum(step / np.hypot(sigma, _LEAST_SIGMA_M), _MOST_RATIO),
+        "outward": _outward(scene, place), **_of_returns(scene, place),
+    }  # fmt: skip
+    ends = np.cumsum([len(n.x_m) for n in nodes])
+    rows = [slice(end - len(n.x_m), end) for end, n in zip(ends, nodes, strict=True)]
+    out = {name: np.concatenate([_medians_of_known(column[k]) for k in rows]) for name, column in measured.items()}
+    length_m, seen_m = (NODE_M * np.array([f(e.seen) for e in edges], np.float64) for f in (len, np.count_nonzero))
+    evidence = np.array([e.evidence for e in edges]) / np.maximum(seen_m, NODE_M)
+    of_edges = {"length_m": np.minimum(length_m, _LONG_M), "evidence": np.minimum(evidence, _MOST_EVIDENCE)}
+    return out | {name: np.repeat(values, [len(n.x_m) for n in nodes]) for name, values in of_edges.items()}
+
+
+def _medians_of_known(values: Float64) -> Float64:
+    """Returns the median (n,) of the known among the values around each; NaN where none is known."""
+    half = _AROUND_NODES // 2
+    held = np.lib.stride_tricks.sliding_window_view(np.pad(values, half, constant_values=np.nan), _AROUND_NODES)
+    ordered, known = np.sort(held, axis=1), np.isfinite(held).sum(axis=1)  # NaN come last
+    row = np.arange(len(values))
+    low, high = (ordered[row, np.maximum(at, 0)] for at in ((known - 1) // 2, known - 1 - (known - 1) // 2))
+    return np.where(known > 0, 0.5 * (low + high), np.nan)
+
+
+def _of_returns(scene: Scene, place: Float64) -> dict[str, Float64]:
+    """Shares of the returns on each side of the edges that stand above the ground and that show plants; how beams cross
+    the edges: 0 at a right angle, as they meet the ring that a laser draws on the ground.
+    """
+    raster, returns, count = raster_of(scene), scene.returns, len(place)
+    rows = np.flatnonzero(_near(place, raster)[np.maximum(raster.cell, 0)] & (raster.cell >= 0))
+    away, owner = scipy.spatial.cKDTree(place[:, :2]).query(
+        np.column_stack([returns.x_m[rows], returns.y_m[rows]]), distance_upper_bound=_BESIDE_M
+    )
+    rows, owner = rows[np.isfinite(away)], owner[np.isfinite(away)].astype(np.int64)
+    x, y, ux, uy = place[owner].T
+    across = (returns.x_m[rows] - x) * uy - (returns.y_m[rows] - y) * ux
+    above = scene.above_ground_m[rows]
+
+    def share(of: tuple[float, float], among: Bool) -> Float64:
+        number, held = (
+            np.bincount(owner[k], minlength=count) for k in (among, among & (above > of[0]) & (above < of[1]))
+        )
+        return np.where(number > 0, held / np.maximum(number, 1), np.nan)
+
+    sides = {"high": across > _FACE_M, "low": across < -_FACE_M}
+    dx, dy = returns.x_m[rows] - returns.sensor_x_m[rows], returns.y_m[rows] - returns.sensor_y_m[rows]
+    on_ground = raster.used[rows] & (sides["high"] | sides["low"])
+    crossing = np.abs(dx * ux + dy * uy) / np.maximum(np.hypot(dx, dy), 1e-9)
+    number = np.bincount(owner[on_ground], minlength=count)
+    total = np.bincount(owner[on_ground], crossing[on_ground], minlength=count)
+    return {
+        **{f"{name}_{side}": share(of, own) for name, of in (("stands", _STANDING_M), ("grows", _PLANTS_M))
+           for side, own in sides.items()},
+        "crossing": np.where(number > 0, total / np.maximum(number, 1), np.nan),
+    }  # fmt: skip
+
+
+def _near(place: Float64, raster: HeightRaster) -> Bool:
+    """Returns a mask of flat cells that come near to nodes."""
+    mark = np.zeros(raster.count.shape, np.bool_)
+    mark[raster.cells_of(place[:, 0], place[:, 1])] = True
+    away = scipy.ndimage.distance_transform_edt(~mark) * raster.cell_m
+    return np.asarray(away.ravel() <= _BESIDE_M + raster.cell_m)
+
+
+def _outward(scene: Scene, place: Float64) -> Float64:
+    """Returns the sine (n,) by which the higher side lies away from the nearest place of the drive."""
+    drive = scene.drive_xyh_m
+    if not len(drive):
+        return np.full(len(place), np.nan)
+    away, at = scipy.spatial.cKDTree(drive[:, :2]).query(place[:, :2])
+    x, y, ux, uy = place.T
+    return np.asarray(((x - drive[at, 0]) * uy - (y - drive[at, 1]) * ux) / np.maximum(away, 1e-9))
+
+
+KERB: Final = Judge("kerb", "cdef227f1ee2f1fc")
+"""Whether a node of an edge lies at a kerb."""
+LEAST: Final = 0.5
+"""An edge is cut where it is less probable (smoothed) that it is a kerb."""
+_SMOOTH_NODES: Final = 7  # Probabilities are means over this many nodes (3 m).
+_HOLE_NODES: Final = 4  # A shorter run of doubtful nodes (2 m) does not cut an edge.
+_SHORTEST_M: Final = 1.5  # Shorter parts are left out (m).
+_FENCE_M: Final = (0.35, 1.2)
+"""Heights above the ground at which every fence and wall is seen (m)."""
+_LEAST_RETURNS: Final = 2  # An object has at least this many returns in a cell.
+_MOST: Final = 0.5  # Share of an edge from which it counts as taken.
+_VEHICLE_M: Final = 0.9  # Half of a vehicle's width (m).
+_OTHERS: Final = (
+    classes.VEHICLE, classes.PERSON, classes.LOW_NOISE, classes.HIGH_NOISE, classes.LOW_VEGETATION,
+    classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION,
+)  # fmt: skip
+"""Classes that stand at kerbs and are no fence."""
+
+
+@once_a_scene
+def free_edges(scene: Scene) -> list[Edge]:
+    """Returns the parts of the scene's edges that are kerbs, with the probability at each node."""
+    edges = open_edges(scene)
+    if not edges:
+        return []
+    stated = KERB.probability(node_features(scene, edges))
+    ends = np.cumsum([len(edge.seen) for edge in edges])
+    return [part for edge, end in zip(edges, ends, strict=True)
+            for part in kerb_parts(edge, stated[end - len(edge.seen) : end])]  # fmt: skip
+
+
+def open_edges(scene: Scene) -> list[Edge]:
+    """Returns the scene's edges without those at whose foot mostly something stands, and those under a drive."""
+    raster, edges = raster_of(scene), edges_of(scene)
+    if not edges:
+        return []
+    taken = _standing(scene) | _driven(scene)
+    return [e for e in edges if np.mean(taken[raster.cells_of(e.nodes.x_m, e.nodes.y_m)]) <= _MOST]
+
+
+def _driven(scene: Scene) -> Bool:
+    """Returns a mask (rows, columns) of the cells within half a vehicle's width of a drive."""
+    raster, drive = raster_of(scene), scene.drive_xyh_m
+    inside = np.zeros(raster.count.shape, np.bool_)
+    corner = np.array([raster.x_min_m, raster.y_min_m])
+    for number in np.unique(drive[:, 3]).tolist():
+        x, y = (np.ascontiguousarray(drive[drive[:, 3] == number, k]) for k in (0, 1))
+        mark_corridor(x, y, _VEHICLE_M, corner, raster.cell_m, inside)
+    return inside
+
+
+def _standing(scene: Scene) -> Bool:
+    """Returns a mask (rows, columns) of the cells at which two returns or more are as high as a fence."""
+    raster, above = raster_of(scene), scene.above_ground_m
+    counted = np.ones(256, np.bool_)
+    counted[list(_OTHERS)] = False
+    stands = (above > _FENCE_M[0]) & (above < _FENCE_M[1]) & counted[scene.classes] & (raster.cell >= 0)
+    number = np.bincount(raster.cell[stands], minlength=raster.count.size).reshape(raster.count.shape)
+    wider = cv2.dilate((number >= _LEAST_RETURNS).astype(np.uint8), np.ones((3, 3), np.uint8))
+    return np.asarray(wider > 0)
+
+
+def kerb_parts(edge: Edge, probability: Float64) -> list[Edge]:
+    """Returns the runs of an edge's nodes that are more probably a kerb than not; probability : (n,) of each node.
+
+    Nodes whose step is hidden are as probable as the seen ones around them.
+    """
+    at = np.arange(len(probability))
+    told = np.interp(at, at[edge.seen], probability[edge.seen])
+    smooth = scipy.ndimage.uniform_filter1d(told, _SMOOTH_NODES, mode="nearest")
+    good = np.pad(smooth >= LEAST, _HOLE_NODES)
+    whole = scipy.ndimage.binary_closing(good, np.ones(_HOLE_NODES + 1))[_HOLE_NODES:-_HOLE_NODES]
+    number, count = scipy.ndimage.label(whole)
+    parts = []
+    for k in range(1, count + 1):
+        rows = np.flatnonzero(number == k)
+        if (len(rows) - 1) * NODE_M >= _SHORTEST_M and edge.seen[rows].any():
+            share = len(rows) / len(edge.seen)
+            parts.append(Edge(edge.nodes.at(rows), edge.seen[rows], edge.evidence * share, smooth[rows]))
+    return parts

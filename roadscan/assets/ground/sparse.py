@@ -7,16 +7,56 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from roadscan.assets.ground.breaks import with_crests
-from roadscan.assets.ground.filling import filled
-from roadscan.assets.ground.grid import grid_over
-from roadscan.assets.ground.morphological import bare_cells, without_pits
-from roadscan.assets.ground.surface import Found, Place, Surface
-from roadscan.assets.kernels.ground_cells import cell_heights
-from roadscan.assets.kernels.heights import heights_above
-from roadscan.assets.kernels.lowest import lowest_returns
+from roadscan.assets.bins import cells_of
+from roadscan.assets.ground.surface import Found, Grid, Place, Surface, bare_cells, filled, grid_over, without_pits
+from roadscan.assets.kernels.ground import cell_heights, drops_on_both_sides, grow
+from roadscan.assets.kernels.low_returns import heights_above, lowest_returns
 from roadscan.assets.scene import Box
+from roadscan.compute.array_types import Bool, Float32
 from roadscan.core.extras import cv2
+
+_LINES: Final = 8
+"""Lines through a cell: every 22.5 degrees."""
+_NEIGHBOURS: Final = 16
+"""Neighbours of a return, seen from above: two rings in a regular pattern."""
+_LEAST: Final = 3
+"""Neighbours on the ground that carry a return onto it: a wall's returns have one or two."""
+_STEP_M: Final = 0.3
+"""Height up to which neighbours go on as one surface (m): twice the noise of airborne returns of the year 2000."""
+
+
+def with_crests(place: Place, grid: Grid, lowest_m: Float32, sure: Bool, drop_m: float) -> Bool:
+    """Returns a mask (n,) of the returns reached from sure ground without a step, where no ground lies lower on both
+    sides.
+
+    An opening cuts the upper edge of a break, because no window fits beneath it. The edge goes on level with the ground
+    above it; a roof does not, and a bridge, which does, has lower ground on both sides.
+
+    Parameters
+    ----------
+    lowest_m : (rows, columns) lowest returns of the cells, whole.
+    sure : (n,) returns that lie on the ground.
+    drop_m : greatest drop on both sides (m), beyond the steepest terrain of the settings, within the largest object.
+    """
+    from scipy.spatial import cKDTree
+
+    returns, settings = place.returns, place.settings
+    found = sure.copy()
+    if len(returns) <= _NEIGHBOURS:
+        return found
+    turn = np.pi / _LINES * np.arange(_LINES)
+    drops = np.empty(grid.shape, np.float32)
+    lines = np.column_stack([np.sin(turn), np.cos(turn)])
+    drops_on_both_sides(
+        lowest_m, lines, round(settings.largest_object_m / grid.cell_m), settings.steepest * grid.cell_m, drops
+    )
+    cell = cells_of(returns.x_m, returns.y_m, (grid.x_min_m, grid.y_min_m, grid.cell_m), grid.shape)
+    may = (cell >= 0) & (drops.flat[np.maximum(cell, 0)] <= drop_m)
+    places = np.column_stack([returns.x_m, returns.y_m])
+    near = cKDTree(places).query(places, k=_NEIGHBOURS + 1)[1][:, 1:]
+    grow(returns.height_m, np.ascontiguousarray(near, np.int64), may, _STEP_M, _LEAST, found)
+    return found
+
 
 CELL_M: Final = 1.0  # Edge of a cell (m).
 _PIT_M: Final = 8.0
@@ -54,7 +94,7 @@ def sparse_ground(place: Place, rules: SparseRules = RULES) -> Found:
     lowest_returns(x, y, z, grid.origin, 1.0 / grid.cell_m, lowest)
     surface, known = without_pits(lowest, _PIT_M, grid)
     known &= bare_cells(surface, grid.cell_m, place.settings)
-    first = near(place, smoothed(Surface(grid, filled(lowest, known, grid.corner, grid.cell_m))), rules, _CLOSE)
+    first = near(place, smoothed(Surface(grid, filled(lowest, known, grid))), rules, _CLOSE)
     found = near(place, smoothed(remade(place, first)), rules, 1.0)
     sure = found.on_ground & (np.abs(found.above_m) <= _TOLERANCE_M)
     wider = with_crests(place, grid, surface, sure, rules.drop_m)
@@ -102,4 +142,4 @@ def remade(place: Place, found: Found) -> Surface:
     cell_heights(x, y, found.above_m, found.on_ground, grid.origin, 1.0 / grid.cell_m, middle, wide, sums)
     seen = sums[..., 0] > 0
     mean = np.divide(sums[..., 1], sums[..., 0], out=np.zeros(grid.shape), where=seen)
-    return Surface(grid, filled((found.base.height_m + mean).astype(np.float32), seen, grid.corner, grid.cell_m))
+    return Surface(grid, filled((found.base.height_m + mean).astype(np.float32), seen, grid))

@@ -21,8 +21,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.assets.judgement.kernels.boosted_trees import tree_sums
-from roadscan.compute.array_types import Float64
+from roadscan.assets.kernels.boosted_trees import tree_sums
+from roadscan.compute.array_types import Bool, Float64
 from roadscan.core.errors import RoadscanError
 
 FOLDER: Final = Path(__file__).parent / "models"
@@ -31,14 +31,14 @@ _MOST_ODDS: Final = 9.2
 
 
 class Trees(NamedTuple):
-    """Nodes (m,) of all trees, as :func:`roadscan.assets.judgement.kernels.boosted_trees.tree_sums` reads them."""
+    """Nodes (m,) of all trees, as :func:`roadscan.assets.kernels.boosted_trees.tree_sums` reads them."""
 
     starts: npt.NDArray[np.int32]
     feature: npt.NDArray[np.int32]
     threshold: Float64
     left: npt.NDArray[np.int32]
     right: npt.NDArray[np.int32]
-    missing_left: npt.NDArray[np.bool_]
+    missing_left: Bool
     value: Float64
 
 

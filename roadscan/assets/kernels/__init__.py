@@ -1,1 +1,1 @@
-"""Kernels over returns of lidars: ground, vehicles, classes."""
+"""Kernels over returns of lidars: ground, edges, paint, vehicles, upright things, classes."""

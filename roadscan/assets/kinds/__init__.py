@@ -1,1 +1,1 @@
-"""Kinds of assets, each one file with one :class:`~roadscan.assets.kind.AssetKind`."""
+"""Kinds of assets: a file holds one :class:`~roadscan.assets.kind.AssetKind`, or several that are found together."""

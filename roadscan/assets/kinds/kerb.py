@@ -8,7 +8,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 import scipy.ndimage
 import scipy.spatial
@@ -16,12 +15,12 @@ import shapely
 from pydantic import Field
 
 from roadscan.assets import classes
-from roadscan.assets.edges.free import free_edges
+from roadscan.assets.edges.find import free_edges
 from roadscan.assets.edges.line_pieces import LINE_PIECES, Line, columns_of, cut_at, dense, joined_lines, pieces_table
-from roadscan.assets.edges.raster import HeightRaster, raster_of
+from roadscan.assets.edges.steps import HeightRaster, raster_of
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
 from roadscan.assets.scene import Scene
-from roadscan.compute.array_types import Float64
+from roadscan.compute.array_types import Bool, Float64
 from roadscan.compute.robust import scatter_about
 from roadscan.compute.ways import way_along
 from roadscan.core.extras import cv2
@@ -163,7 +162,7 @@ def _marked(parts: Sequence[Float64], scene: Scene, raster: HeightRaster) -> tup
     return (Marked(rows[on_face], classes.KERB),)
 
 
-def _cells_near(places: Float64, raster: HeightRaster) -> npt.NDArray[np.bool_]:
+def _cells_near(places: Float64, raster: HeightRaster) -> Bool:
     """Returns a mask of flat cells (rows · columns + 1,) with all returns within reach of some places (k, 2)."""
     reach = math.ceil(FACE_REACH_M / raster.cell_m)
     near = np.zeros(raster.count.shape, np.uint8)

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from roadscan.assets.edges.along_drive import EDGE_COLUMNS, FARTHEST_M, road_edges
 from roadscan.assets.edges.line_pieces import Line, joined_lines, line_schema, pieces_table
-from roadscan.assets.edges.raster import raster_of
+from roadscan.assets.edges.steps import raster_of
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence
 from roadscan.assets.scene import Scene
 from roadscan.core.strict import Strict

@@ -1,4 +1,4 @@
-"""Road markings that are no lane lines: stop bars, crosswalks, arrows, symbols."""
+"""Road markings that are no lane lines: stop bars, crosswalks, arrows, symbols, and their types by shape."""
 
 from __future__ import annotations
 
@@ -8,15 +8,243 @@ from dataclasses import replace
 from typing import Any, ClassVar, Final
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
+import shapely
 
 from roadscan.assets.classes import MARKING
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
-from roadscan.assets.paint.detection import Patch, paint_of, rows_of_paint
-from roadscan.assets.paint.markings import markings
-from roadscan.assets.paint.patch_pieces import PATCH_PIECES, patch_pieces
+from roadscan.assets.paint.components import CELL_M
+from roadscan.assets.paint.detection import Paint, Patch, height_sigma, paint_of, rows_of_paint
 from roadscan.assets.scene import Scene
-from roadscan.assets.upright.places import places_of
+from roadscan.assets.upright.slices import places_of
+from roadscan.compute.array_types import Bool, Float64
+
+PATCH_PIECES: Final = pa.schema(
+    [
+        pa.field("shape", pa.binary()),
+        pa.field("in_crosswalk", pa.bool_()),
+        pa.field("road_rad", pa.float64()),
+        pa.field("height_m", pa.float64()),
+        pa.field("slope_east", pa.float64()),
+        pa.field("slope_north", pa.float64()),
+        pa.field("contrast", pa.float64()),
+        pa.field("sigma_height_m", pa.float64()),
+        pa.field("probability", pa.float64()),
+        pa.field("returns", pa.int64()),
+        pa.field("passes", pa.list_(pa.uint16())),
+        pa.field("first_epoch_gps_ns", pa.int64()),
+        pa.field("last_epoch_gps_ns", pa.int64()),
+    ]
+)
+"""A polygon in the map (WKB), the plane of the ground at its middle, and the direction of the road there."""
+
+
+def patch_pieces(scene: Scene, paint: Paint) -> pa.Table:
+    """Returns pieces of patches within the scene's tile, in the order of the paint's patches."""
+    tile = shapely.box(scene.tile.x_min_m, scene.tile.y_min_m, scene.tile.x_max_m, scene.tile.y_max_m)
+    rows = []
+    for patch in paint.patches:
+        shape = shapely.intersection(patch.shape, tile)
+        if shape.area > 0.0:
+            rows.append(_piece(scene, paint, patch, shape))
+    return pa.Table.from_pylist(rows, schema=PATCH_PIECES)
+
+
+def _piece(scene: Scene, paint: Paint, patch: Patch, shape: shapely.Geometry) -> dict[str, object]:
+    seen = scene.returns.at(paint.contrast.rows[patch.returns])
+    inside = scene.tile.holds(seen.x_m, seen.y_m)
+    own = seen.at(inside) if inside.any() else seen
+    middle = shape.centroid
+    east, north = scene.returns.corner_m
+    ground, step = scene.ground, scene.ground.cell_m
+    heights = ground.height_at(
+        middle.x + step * np.array([0.0, 1.0, -1.0, 0.0, 0.0]), middle.y + step * np.array([0.0, 0.0, 0.0, 1.0, -1.0])
+    )
+    moved = shapely.transform(shape, lambda xy: xy + np.array([east, north]))
+    return {
+        "shape": shapely.to_wkb(moved),
+        "in_crosswalk": patch.in_crosswalk,
+        "road_rad": patch.road_rad,
+        "height_m": float(heights[0]),
+        "slope_east": float((heights[1] - heights[2]) / (2 * step)),
+        "slope_north": float((heights[3] - heights[4]) / (2 * step)),
+        "contrast": patch.contrast,
+        "sigma_height_m": height_sigma(own.height_m - ground.height_at(own.x_m, own.y_m)),
+        "probability": patch.probability,
+        "returns": int(np.count_nonzero(inside)),
+        "passes": [int(p) for p in np.unique(own.pass_id)],
+        "first_epoch_gps_ns": int(own.epoch_gps_ns.min()),
+        "last_epoch_gps_ns": int(own.epoch_gps_ns.max()),
+    }
+
+
+_MARKER_M: Final = 0.30  # Largest marker (m).
+_BAR_ALONG_M: Final = (0.15, 1.0)  # Extent of a bar along the road (m).
+_BAR_ACROSS_M: Final = 1.0  # Least extent of a bar across the road (m).
+_BAR_FILLED: Final = 0.7  # Least share of its rectangle that a bar covers.
+_ARROW_ALONG_M: Final = (1.2, 8.0)  # Extent of an arrow along the road (m).
+_ARROW_ACROSS_M: Final = (0.25, 2.5)  # Extent of an arrow across the road (m).
+_HEAD_TO_SHAFT: Final = 1.6  # Least ratio of an arrow's head to its shaft.
+_SLICES: Final = 12  # Slices along a shape whose widths are compared.
+_SYMBOL_M: Final = 6.0
+"""Larger shapes (m) are areas."""
+
+
+def type_of(outline: shapely.Geometry, road_rad: float) -> str:
+    """Returns the type of a polygon in the map, where the road runs in a direction (rad, anticlockwise from east)."""
+    turned = _turned(outline, road_rad)
+    along_min, across_min, along_max, across_max = turned.bounds
+    along, across = along_max - along_min, across_max - across_min
+    if max(along, across) <= _MARKER_M:
+        return "raised_marker"
+    filled = outline.area / max(shapely.minimum_rotated_rectangle(outline).area, 1e-9)
+    if (
+        _BAR_ALONG_M[0] <= along <= _BAR_ALONG_M[1]
+        and across >= max(_BAR_ACROSS_M, 2.0 * along)
+        and filled >= _BAR_FILLED
+    ):
+        return "stop_bar"
+    if _is_arrow(turned):
+        return "arrow"
+    return "symbol" if max(along, across) <= _SYMBOL_M else "area"
+
+
+def _is_arrow(turned: shapely.Geometry) -> bool:
+    """Returns True for a slim shaft along x with one wide end."""
+    x_min, y_min, x_max, y_max = turned.bounds
+    along, across = x_max - x_min, y_max - y_min
+    slim = _ARROW_ALONG_M[0] <= along <= _ARROW_ALONG_M[1] and _ARROW_ACROSS_M[0] <= across <= _ARROW_ACROSS_M[1]
+    if not slim or along < 1.2 * across:
+        return False
+    widths = _widths(turned)
+    half = _SLICES // 2
+    ends = float(widths[:half].max()), float(widths[half:].max())
+    shaft = float(np.median(widths))
+    other = float(np.median(widths[half:] if ends[0] > ends[1] else widths[:half]))
+    return shaft > 0.0 and max(ends) >= _HEAD_TO_SHAFT * shaft and min(ends) <= 1.35 * max(other, 0.05)
+
+
+def _widths(turned: shapely.Geometry) -> Float64:
+    """Returns the painted width of slices along x."""
+    x_min, y_min, x_max, y_max = turned.bounds
+    edges = np.linspace(x_min, x_max, _SLICES + 1)
+    slices = shapely.box(edges[:-1], y_min, edges[1:], y_max)
+    return np.asarray(shapely.area(shapely.intersection(slices, turned)) / np.diff(edges))
+
+
+def _turned(outline: shapely.Geometry, road_rad: float) -> shapely.Geometry:
+    """Returns the outline with the road's direction along x."""
+    cos, sin = np.cos(road_rad), np.sin(road_rad)
+    turn = np.array([[cos, -sin], [sin, cos]])
+    middle = shapely.get_coordinates(outline.centroid)
+    return shapely.transform(shapely.force_2d(outline), lambda xy: (xy - middle) @ turn)
+
+
+_TOUCHING_M: Final = 0.03  # Pieces this near to one another (m) touch.
+_LINE_HALF_M: Final = 0.1  # Half width of lines that are cut off a marking (m).
+_BAR_GAP_M: Final = 1.2
+"""Greatest gap between bars of a crosswalk (m)."""
+
+
+def markings(table: pa.Table) -> list[AssetObject]:
+    """Markings of the pieces (:data:`~roadscan.assets.kinds.road_marking.PATCH_PIECES`), by easting and northing."""
+    if not table.num_rows:
+        return []
+    shapes = shapely.from_wkb(table["shape"].to_numpy(zero_copy_only=False))
+    order = np.lexsort(shapely.bounds(shapes).T[::-1])
+    shapes, table = shapes[order], table.take(pa.array(order))
+    in_crosswalk = np.asarray(table["in_crosswalk"].to_numpy(zero_copy_only=False), np.bool_)
+    group = _groups(shapes, in_crosswalk)
+    found = [_object(shapes[group == g], table.take(pa.array(np.flatnonzero(group == g)))) for g in np.unique(group)]
+    return sorted(found, key=lambda one: one.geometry.bounds)
+
+
+def _groups(shapes: npt.NDArray[Any], in_crosswalk: Bool) -> npt.NDArray[np.int64]:
+    """Returns the number (n,) of each piece's marking."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    tree = shapely.STRtree(shapes)
+    one, other = tree.query(shapes, predicate="dwithin", distance=_BAR_GAP_M)
+    together = (in_crosswalk[one] & in_crosswalk[other]) | (
+        (shapely.distance(shapes[one], shapes[other]) <= _TOUCHING_M) & (in_crosswalk[one] == in_crosswalk[other])
+    )
+    links = coo_array((np.ones(int(together.sum())), (one[together], other[together])), shape=(len(shapes),) * 2)
+    return np.asarray(connected_components(links, directed=False)[1], np.int64)
+
+
+def _object(shapes: npt.NDArray[Any], table: pa.Table) -> AssetObject:
+    """Returns the marking of some pieces."""
+    painted = shapely.union_all(shapes)
+    crosswalk = bool(np.any(table["in_crosswalk"].to_numpy(zero_copy_only=False)))
+    outline = painted.convex_hull if crosswalk else _whole(painted)
+    roads = table["road_rad"].to_numpy()
+    road = float(roads[np.isfinite(roads)][0]) if np.isfinite(roads).any() else _own_direction(outline)
+    bar = _without_lines(outline)
+    if not crosswalk and type_of(bar, road) == "stop_bar":
+        outline = painted = bar
+    along, across = _extent(outline, road)
+    returns = np.maximum(table["returns"].to_numpy(), 1)
+    return AssetObject(
+        geometry=_with_heights(outline, shapes, table),
+        sigma_horizontal_m=float(CELL_M / np.sqrt(12.0)),
+        sigma_height_m=float(np.average(table["sigma_height_m"].to_numpy(), weights=returns)),
+        probability=float(np.average(table["probability"].to_numpy(), weights=returns)),
+        returns=int(table["returns"].to_numpy().sum()),
+        passes=len({p for row in table["passes"].to_pylist() for p in row}),
+        first_epoch_gps_ns=int(table["first_epoch_gps_ns"].to_numpy().min()),
+        last_epoch_gps_ns=int(table["last_epoch_gps_ns"].to_numpy().max()),
+        attributes={
+            "type": "crosswalk" if crosswalk else type_of(outline, road),
+            "length_m": along,
+            "width_m": across,
+            "area_m2": float(painted.area),
+            "contrast": 1.0 + float(np.average(table["contrast"].to_numpy(), weights=returns)),
+        },
+        sigma_size_m=float(CELL_M / np.sqrt(6.0)),
+    )
+
+
+def _whole(painted: shapely.Geometry) -> shapely.Geometry:
+    """Returns one polygon; parts that touch at corners are merged."""
+    if painted.geom_type == "Polygon":
+        return painted
+    closed = painted.buffer(_TOUCHING_M, join_style="mitre").buffer(-_TOUCHING_M, join_style="mitre")
+    return closed if closed.geom_type == "Polygon" else painted.convex_hull
+
+
+def _without_lines(outline: shapely.Geometry) -> shapely.Geometry:
+    """Returns the thick part of a polygon, without lines that touch it."""
+    thick = outline.buffer(-_LINE_HALF_M, join_style="mitre").buffer(_LINE_HALF_M, join_style="mitre")
+    return thick if thick.geom_type == "Polygon" and not thick.is_empty else outline
+
+
+def _own_direction(outline: shapely.Geometry) -> float:
+    """Returns the direction (rad) of the longer side of the least rectangle around it."""
+    corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(outline))
+    sides = np.diff(corners[:3], axis=0)
+    side = sides[int(np.argmax(np.hypot(*sides.T)))]
+    return float(np.arctan2(side[1], side[0]))
+
+
+def _extent(outline: shapely.Geometry, road_rad: float) -> tuple[float, float]:
+    """Returns the extent along and across a direction."""
+    xy = shapely.get_coordinates(outline)
+    along = xy @ np.array([np.cos(road_rad), np.sin(road_rad)])
+    across = xy @ np.array([-np.sin(road_rad), np.cos(road_rad)])
+    return float(np.ptp(along)), float(np.ptp(across))
+
+
+def _with_heights(outline: shapely.Geometry, shapes: npt.NDArray[Any], table: pa.Table) -> shapely.Geometry:
+    """Returns the outline with the height of the plane of the nearest piece at each corner."""
+    xy = shapely.get_coordinates(outline)
+    nearest = shapely.STRtree(shapes).nearest(shapely.points(xy))
+    middle = shapely.get_coordinates(shapely.centroid(shapes))[nearest]
+    base, east, north = (table[n].to_numpy()[nearest] for n in ("height_m", "slope_east", "slope_north"))
+    height = base + (xy[:, 0] - middle[:, 0]) * east + (xy[:, 1] - middle[:, 1]) * north
+    return shapely.set_coordinates(shapely.force_3d(outline), np.column_stack([xy, height]))
+
 
 _LARGE_M2: Final = 0.5  # Larger patches are not tested for a post (m²).
 _STANDS_M: Final = (0.3, 1.5)  # Heights above the ground (m) between which a post is seen.

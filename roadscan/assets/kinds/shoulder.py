@@ -14,8 +14,7 @@ import shapely
 from pydantic import Field
 
 from roadscan.assets.edges.along_drive import FARTHEST_M, road_edges
-from roadscan.assets.edges.line_pieces import dense
-from roadscan.assets.edges.strips import ribbon
+from roadscan.assets.edges.line_pieces import dense, ribbon
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, KindOptions
 from roadscan.assets.scene import Scene
 from roadscan.compute.array_types import Float64

@@ -9,9 +9,8 @@ import numpy as np
 import pyarrow as pa
 from pydantic import Field
 
-from roadscan.assets.edges.beside import BESIDE_PIECES, pieces_beside
-from roadscan.assets.edges.line_pieces import joined_lines
-from roadscan.assets.edges.strips import Strip, polygon_of, running_slope, sigma_width_m, strips_of
+from roadscan.assets.edges.along_drive import BESIDE_PIECES, pieces_beside
+from roadscan.assets.edges.line_pieces import Strip, joined_lines, polygon_of, running_slope, sigma_width_m, strips_of
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence
 from roadscan.assets.kinds.kerb import types_along
 from roadscan.assets.scene import Scene

@@ -6,12 +6,55 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
-from roadscan.assets.paint.components import SEED_CONTRAST, Component
-from roadscan.assets.paint.contrast import CELL_M, Contrast
-from roadscan.assets.paint.road_direction import RoadDirection
+from roadscan.assets.paint.components import CELL_M, SEED_CONTRAST, Component, Contrast
 from roadscan.assets.quantiles import median
+from roadscan.assets.scene import Scene
 from roadscan.compute.array_types import Float64, Int64
+from roadscan.compute.ways import way_along
+
+_DRIVE_STEP_M: Final = 1.0  # Distance of points along a drive (m).
+_OVER_M: Final = 3.0
+"""The direction is that of a chord of twice this length (m)."""
+_FARTHEST_M: Final = 25.0  # No direction is known farther from all drives (m).
+
+
+class RoadDirection:
+    """Direction of the drive nearest to a place."""
+
+    def __init__(self, scene: Scene) -> None:
+        places, directions = [np.zeros((0, 2))], [np.zeros(0)]
+        drive = scene.drive_xyh_m
+        for number in np.unique(drive[:, 3]) if len(drive) else []:
+            xy = drive[drive[:, 3] == number, :2]
+            driven = way_along(xy)
+            moved = np.concatenate([[True], np.diff(driven) > 1e-6])
+            if np.count_nonzero(moved) < 2:
+                continue
+            at = np.arange(0.0, driven[-1] + _DRIVE_STEP_M, _DRIVE_STEP_M)
+            place = _along(at, driven[moved], xy[moved])
+            chord = _along(at + _OVER_M, driven[moved], xy[moved]) - _along(at - _OVER_M, driven[moved], xy[moved])
+            places.append(place)
+            directions.append(np.arctan2(chord[:, 1], chord[:, 0]))
+        self._place = np.concatenate(places)
+        self._direction = np.concatenate(directions)
+
+    def at(self, x_m: float, y_m: float) -> float:
+        """Returns the direction (rad) anticlockwise from x; NaN where no drive is within 25 m."""
+        if not self._direction.size:
+            return float("nan")
+        away = np.hypot(self._place[:, 0] - x_m, self._place[:, 1] - y_m)
+        nearest = int(np.argmin(away))
+        return float(self._direction[nearest]) if away[nearest] <= _FARTHEST_M else float("nan")
+
+
+def _along(
+    at: npt.NDArray[np.float64], driven: npt.NDArray[np.float64], xy: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """Returns points (n, 2) at lengths along a line, clamped to its ends."""
+    return np.stack([np.interp(at, driven, xy[:, i]) for i in (0, 1)], axis=1)
+
 
 CHUNK_M: Final = 5.0
 """Long components are cut at multiples of this in the map (m), so that each piece is straight."""
@@ -32,7 +75,7 @@ _UNEVEN: Final = 0.5
 """Paint lies on one surface: its sides differ by less than this share of its contrast to them, or it is as bright as
 paint against the brighter one too, as where fresh bitumen lies along a line."""
 _STEEPEST: Final = 0.15  # Steepest ground (m/m).
-_STEP_M: Final = 0.04  # Greatest step between a band and one side (m).
+_SIDE_STEP_M: Final = 0.04  # Greatest step between a band and one side (m).
 _TWO_SHORTEST_M: Final = 1.0  # Shortest band that may be a double line (m).
 _LEAST_APART_M: Final = 0.12
 """Least length of two lines side by side, and least distance of their middles (m)."""
@@ -217,7 +260,7 @@ def _is_an_edge(found: Contrast, component: Component, stripe: Stripe) -> bool:
     lone = max(np.nan_to_num(abs(left - inside)), np.nan_to_num(abs(right - inside)))
     above = levels[0] - (levels[1] + levels[2]) / 2
     uneven = abs(levels[1] - levels[2]) > _UNEVEN * above and levels[0] - max(levels[1], levels[2]) < SEED_CONTRAST
-    return bool(bend > _BEND_M or slope > _STEEPEST or lone > _STEP_M or uneven)
+    return bool(bend > _BEND_M or slope > _STEEPEST or lone > _SIDE_STEP_M or uneven)
 
 
 def _centred(stripe: Stripe, along: Float64, across: Float64, excess: Float64) -> Stripe | None:

@@ -1,7 +1,7 @@
 """The contract of a reader of an asset's pictures, and the registry that finds readers.
 
-A reader is one file of `roadscan/assets/pictures/readers/` (or an entry point of the group
-``roadscan.asset_picture_readers``) with a subclass of :class:`PictureReader` that has the name of a kind of assets. A
+A reader is a subclass of :class:`PictureReader` in a file of `roadscan/assets/pictures/readers/` (or an entry point of
+the group ``roadscan.asset_picture_readers``) that has the name of a kind of assets. A
 kind without one still gets the pictures that show it best.
 """
 
@@ -15,8 +15,7 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 
-from roadscan.assets.kind import AssetObject
-from roadscan.assets.object_table import reference_point
+from roadscan.assets.kind import AssetObject, reference_point
 from roadscan.compute.array_types import Float64, UInt8
 from roadscan.core.plugins import found_kinds
 

@@ -13,19 +13,16 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.assets.files.bare_earth import write_bare_earth
-from roadscan.assets.files.classified_points import classified_points, write_classified
+from roadscan.assets.files.squares import classified_points, write_bare_earth, write_classified
 from roadscan.assets.ground.bare_earth import within
-from roadscan.assets.ground.settings import GroundSettings
 from roadscan.assets.intensity import calibrated_scene
 from roadscan.assets.kind import AssetKind, Evidence, Marked, asset_kinds
-from roadscan.assets.scene import Scene
-from roadscan.assets.screens import screens_of
-from roadscan.assets.statistics import Statistics
+from roadscan.assets.scene import Scene, Statistics
+from roadscan.assets.settings import GroundSettings
+from roadscan.assets.tasks.gains import Shared
 from roadscan.assets.tasks.load_returns import LoadedSquare, ReturnsTask, load_squares, scene_of
 from roadscan.assets.tasks.plan import AssetPlan
-from roadscan.assets.tasks.shared import Shared
-from roadscan.assets.visibility import CELL_M, passes_in_sight
+from roadscan.assets.visibility import CELL_M, passes_in_sight, screens_of
 from roadscan.core.errors import SchemaError
 from roadscan.core.grid import TileId
 from roadscan.core.strict import Strict

@@ -6,22 +6,20 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.assets.edges.raster import raster_of
-from roadscan.assets.ground.settings import GroundSettings
+from roadscan.assets.edges.steps import raster_of
 from roadscan.assets.intensity import GAINS_SCHEMA, IntensitySample, gains_of, intensity_sample, light_of
-from roadscan.assets.scene import Scene
-from roadscan.assets.statistics import Measured, Statistics, together
+from roadscan.assets.kinds.landscape_area import roughness_of_road_m
+from roadscan.assets.scene import Measured, Scene, Statistics, together
+from roadscan.assets.settings import GroundSettings
 from roadscan.assets.tasks.load_returns import LoadedSquare, ReturnsTask, load_squares, scene_of
 from roadscan.assets.tasks.plan import AssetPlan, cut_squares, grid_of, readings_of, square_key
-from roadscan.assets.tasks.shared import Shared
 from roadscan.assets.tiling import AssetGrid, Halos
-from roadscan.assets.upright.grown import roughness_of_road_m
 from roadscan.core.grid import TileId
 from roadscan.run.code_reach import code_digest
 from roadscan.run.engine.compute import reason_of
@@ -29,10 +27,34 @@ from roadscan.run.engine.fingerprint import key_of
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
+from roadscan.store.store import Store
 from roadscan.store.writer import parquet_bytes
 from roadscan.tiles.blocks import Block
 from roadscan.tiles.tasks.tile_files import publish_file
 from roadscan.tiles.tasks.tiles import TaskResult
+
+
+class Shared(NamedTuple):
+    """Records of the tables. Sent to workers: they carry no data."""
+
+    statistics: OutputRecord
+    gains: OutputRecord | None
+    """None where intensities are used as recorded."""
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Returns the digests of both."""
+        return self.statistics.digest, "" if self.gains is None else self.gains.digest
+
+    def read_gains(self, store: Store) -> pa.Table | None:
+        """Returns the gains of the intensity; None where it is used as recorded."""
+        return None if self.gains is None else recorded_table(store, self.gains)
+
+    def read_statistics(self, store: Store) -> Statistics:
+        """Returns the statistics of the survey."""
+        rows = recorded_table(store, self.statistics)
+        return Statistics(dict(zip(rows["statistic"].to_pylist(), rows["value"].to_pylist(), strict=True)))
+
 
 SAMPLES: Final = "intensity_samples"
 GAINS: Final = "intensity_gains"

@@ -11,12 +11,10 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.assets.bins import distinct_steps, in_bins
-from roadscan.assets.ground.settings import GroundSettings
 from roadscan.assets.kernels.buckets import rows_within, sort_groups
 from roadscan.assets.make_scene import make_scene
-from roadscan.assets.returns import Returns
-from roadscan.assets.scene import Scene
-from roadscan.assets.statistics import Statistics
+from roadscan.assets.scene import Returns, Scene, Statistics
+from roadscan.assets.settings import GroundSettings
 from roadscan.assets.tiling import AssetGrid
 from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.grid import QUANTA_PER_M, QUANTUM_M, TileId

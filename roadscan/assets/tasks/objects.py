@@ -10,11 +10,10 @@ from typing import Final
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.assets.calibration import curve_named
-from roadscan.assets.kind import AssetObject, asset_kinds
-from roadscan.assets.object_table import objects_of_table, table_of_objects
+from roadscan.assets.kind import AssetObject, asset_kinds, objects_of_table, table_of_objects
+from roadscan.assets.probabilities import curve_named
 from roadscan.assets.tasks.evidence import EVIDENCE
-from roadscan.assets.tasks.kinds import WantedKind
+from roadscan.assets.tasks.plan import WantedKind
 from roadscan.assets.tiling import AssetGrid
 from roadscan.core.grid import TileId
 from roadscan.core.strict import Strict

@@ -13,10 +13,9 @@ import pyarrow as pa
 import shapely
 
 from roadscan.assets.pictures.reader import ColourReader, picture_readers
-from roadscan.assets.pictures.settings import AssetPicturesSettings
+from roadscan.assets.settings import AssetPicturesSettings, picture_rule
 from roadscan.assets.tasks.evidence import SCREENS
 from roadscan.assets.tasks.objects import OBJECTS
-from roadscan.assets.tasks.picture_rule import picture_rule
 from roadscan.assets.tasks.plan import AssetPlan
 from roadscan.assets.tiling import AssetGrid
 from roadscan.core.errors import ConfigError, RunError

@@ -11,9 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.pictures.reader import CutOut, Recognition
-from roadscan.assets.pictures.settings import AssetPicturesSettings
-from roadscan.assets.pictures.sign_features import box_px
-from roadscan.assets.pictures.sign_types import sign_types
+from roadscan.assets.pictures.sign_types import box_px, sign_types
+from roadscan.assets.settings import AssetPicturesSettings
 from roadscan.compute.array_types import Float32
 from roadscan.core.errors import ConfigError
 from roadscan.core.extras import cv2, need, needed

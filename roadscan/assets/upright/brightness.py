@@ -13,8 +13,7 @@ import numpy.typing as npt
 
 from roadscan.assets import classes
 from roadscan.assets.intensity import RANGE_NODES_M
-from roadscan.assets.memory import once_a_scene
-from roadscan.assets.scene import Scene
+from roadscan.assets.scene import Scene, once_a_scene
 from roadscan.assets.upright.slices import usable
 from roadscan.compute.array_types import Float64
 

@@ -1,4 +1,4 @@
-"""Pieces of upright surfaces, cut at the borders of tiles, and their chains."""
+"""Pieces of upright surfaces and their chains, outlines of façades, and the returns that belong to them."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.assets.kernels.columns import mark_strip
 from roadscan.assets.quantiles import median
 from roadscan.assets.scene import Box, Scene
 from roadscan.assets.upright.panels import Panel
 from roadscan.assets.upright.pieces import seen_by
-from roadscan.compute.array_types import Float64
+from roadscan.assets.upright.slices import places_of
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.compute.robust import SIGMA_OF_MAD
 
 COUNTS: Final = ("returns", "stopped", "passed", "under", "foot", "cells", "open_cells", "leaves")
@@ -105,7 +106,7 @@ class Chain:
         length = self.values["length_m"] * told
         return float(length @ through) / float(length.sum()) if told.any() else 0.0
 
-    def lets_through(self) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    def lets_through(self) -> tuple[Bool, Bool]:
         """Returns which stretches (k,) enough sight lines met to tell, and which of all let some through."""
         passed, lines = self.values["passed"], self.values["passed"] + self.values["stopped"]
         return (lines >= _LEAST_LINES) | (passed >= _MANY_PASSING), passed - 1.0 >= _LEAST_PASSING * lines
@@ -357,3 +358,41 @@ def _linked(parts: list[Chain]) -> Chain:
         sum(p.seen for p in parts), frozenset().union(*(p.passes for p in parts)),
         (min((e for e, _ in epochs), default=0), max((e for _, e in epochs), default=0)),
     )  # fmt: skip
+
+
+_BEFORE_M, _BEHIND_M = 0.4, 1.5
+"""Balconies stand before the plane of a façade, windows and doors behind it, this far at the most (m)."""
+
+
+def outline(chain: Chain) -> Float64:
+    """Returns the ring (n, 3) of a façade: its lower edge, then its upper edge back; gaps are filled from beside."""
+    low, high = _filled(chain.values["low_m"]), _filled(chain.values["high_m"])
+    xy = np.repeat(chain.xy_m, 2, axis=0)[1:-1]
+    lower, upper = np.column_stack([xy, np.repeat(low, 2)]), np.column_stack([xy, np.repeat(high, 2)])
+    ring = np.concatenate([lower, upper[::-1], lower[:1]])
+    keep = np.append(True, np.abs(np.diff(ring, axis=0)).max(axis=1) > 1e-6)
+    out: Float64 = ring[keep]
+    return out
+
+
+def _filled(values: Float64) -> Float64:
+    known = np.isfinite(values)
+    return np.interp(np.arange(values.size), np.flatnonzero(known), values[known])
+
+
+def beside(scene: Scene, rows: Int64, before_m: float = _BEFORE_M, behind_m: float = _BEHIND_M) -> Int64:
+    """Returns the returns of a surface (`rows`), and those close before and behind it, by default a façade's."""
+    returns = scene.returns
+    xy = np.column_stack([returns.x_m[rows], returns.y_m[rows]])
+    middle = xy.mean(axis=0)
+    some = xy[:: max(1, len(xy) // 20_000)] - middle
+    _, _, axes = np.linalg.svd(some, full_matrices=False)
+    along, normal = axes[0], axes[1]
+    seen = np.array([returns.sensor_x_m[rows].mean(), returns.sensor_y_m[rows].mean()]) - middle
+    normal = normal if float(normal @ seen) > 0.0 else -normal
+    begin, end = float((some @ along).min()) - 0.3, float((some @ along).max()) + 0.3
+    places, inside = places_of(scene), np.zeros(len(returns), np.bool_)
+    inside[rows] = True
+    box = np.array([begin, end, -behind_m, before_m])
+    mark_strip(places.x_m, places.y_m, places.rows, middle, np.stack([along, normal]), box, inside)
+    return np.flatnonzero(inside)

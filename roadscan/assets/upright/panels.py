@@ -13,12 +13,11 @@ import numpy.typing as npt
 from roadscan.assets import classes
 from roadscan.assets.bins import in_bins
 from roadscan.assets.kernels.upright_voxels import beside_line, in_stretches, near_middles, passing_lines
-from roadscan.assets.memory import once_a_scene
 from roadscan.assets.quantiles import median, quantiles
-from roadscan.assets.scene import Box, Scene
-from roadscan.assets.upright.places import places_of
+from roadscan.assets.scene import Box, Scene, once_a_scene
 from roadscan.assets.upright.regions import LOWEST_M, Region, regions_of
-from roadscan.compute.array_types import Float64, Int64
+from roadscan.assets.upright.slices import places_of
+from roadscan.compute.array_types import Bool, Float64, Int64
 
 STRETCH_M: Final = 1.0  # Length of a stretch (m), about.
 _MOST_LINES: Final = 150_000
@@ -86,7 +85,7 @@ class Panel:
     """(k,) quarters of its length and of its height that eight sight lines or more met; `open_cells` is the number of
     those that let one through."""
     open_cells: Int64
-    open_top: npt.NDArray[np.bool_]
+    open_top: Bool
     """(k,) True where the highest laser still meets it: its top is not seen."""
     leaves: Int64
     """(k,) returns that are classed as vegetation."""
@@ -307,7 +306,7 @@ def _with_sight(scene: Scene, panels: list[Panel]) -> list[Panel]:
     return out
 
 
-def _at_foot(scene: Scene, panel: Panel, taken: npt.NDArray[np.bool_], asked: npt.NDArray[np.bool_]) -> Int64:
+def _at_foot(scene: Scene, panel: Panel, taken: Bool, asked: Bool) -> Int64:
     """Returns how many sight lines (k,) of the sample end on the place of a surface below its lower edge."""
     out, returns = np.zeros(panel.returns.size, np.int64), scene.returns
     middle, way = (panel.xy_m[:-1] + panel.xy_m[1:]) / 2, np.diff(panel.xy_m, axis=0)
@@ -332,7 +331,7 @@ def _bands(panel: Panel) -> Float64:
     return np.concatenate([np.stack([edge[:, :-1], edge[:, 1:]], axis=2), below[:, None]], axis=1)
 
 
-def _stopped(scene: Scene, panel: Panel, taken: npt.NDArray[np.bool_]) -> Int64:
+def _stopped(scene: Scene, panel: Panel, taken: Bool) -> Int64:
     """Returns how many sight lines (k, 4, 4) of the sample end in each cell of its stretches."""
     rows, stretch = panel.rows[taken], panel.stretch[taken]
     way = np.diff(panel.xy_m, axis=0)

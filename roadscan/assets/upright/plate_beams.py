@@ -9,8 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from roadscan.assets.kernels.sight import Rays, rays_near
-from roadscan.assets.memory import once_a_scene
-from roadscan.assets.scene import Scene
+from roadscan.assets.scene import Scene, once_a_scene
 from roadscan.assets.upright.brightness import brightness
 from roadscan.compute.array_types import Bool, Float64, Int64
 

@@ -11,11 +11,10 @@ import numpy.typing as npt
 
 from roadscan.assets.bins import in_bins
 from roadscan.assets.kernels.upright_voxels import gather_moments, grow_regions, region_ranges, thin_elements
-from roadscan.assets.memory import once_a_scene
 from roadscan.assets.quantiles import quantiles
-from roadscan.assets.scene import Scene
+from roadscan.assets.scene import Scene, once_a_scene
 from roadscan.assets.upright.slices import usable_above_m
-from roadscan.compute.array_types import Float64, Int64
+from roadscan.compute.array_types import Bool, Float64, Int64
 
 SIDE_M: Final = 0.25  # Side of a voxel (m).
 LAYER_M: Final = 0.5  # Height of a voxel (m).
@@ -95,7 +94,7 @@ def _voxels(scene: Scene) -> _Voxels:
     return _Voxels(index, elements, voxel, corner, found)
 
 
-def on_thin(scene: Scene) -> npt.NDArray[np.bool_]:
+def on_thin(scene: Scene) -> Bool:
     """Returns a mask (n,) of the returns in voxels that, with those beside them, lie on an upright plane."""
     v = _voxels(scene)
     return np.asarray((v.voxel >= 0) & (v.elements[v.voxel, 0] > 0.0))

@@ -1,22 +1,113 @@
-"""Shafts: thin, upright things that stand on the ground with free space around them, as poles and trunks do."""
+"""Shafts, thin upright things with free space around them: their axis, diameter and standard deviations."""
 
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.assets.kernels.slices import slices_above_one_another
-from roadscan.assets.memory import once_a_scene
+from roadscan.assets.kernels.shafts import (
+    LEAST_RADIUS_M,
+    MOST_RADIUS_M,
+    fit_cylinder,
+    longest_run,
+    near_axis,
+    returns_about,
+    slices_above_one_another,
+    widths_of_levels,
+)
 from roadscan.assets.quantiles import median
-from roadscan.assets.scene import Scene
-from roadscan.assets.upright.axis import Axis, fit_axis
-from roadscan.assets.upright.kernels.shafts import longest_run, near_axis, returns_about, widths_of_levels
+from roadscan.assets.scene import Scene, once_a_scene
 from roadscan.assets.upright.slices import CELL_M, LOWEST_M, SLICE_M, Slices, around, slices_of
-from roadscan.compute.array_types import Float64, Int64
+from roadscan.compute.array_types import Bool, Float64, Int64
+
+SECTOR_DEG: Final = 8.0
+"""Sight lines within a sector (degrees) count as of one direction."""
+_LEAST_SEEN: Final = 8
+"""Fewer returns whose sensor's place is known show no width."""
+_NOISE_M: Final = 0.02
+"""Returns farther from the circle than this (m), the noise of many scanners, weigh less."""
+_STIFF_M: Final = 0.05
+"""A slope of 1 counts as so great a distance (m) of every return: what shows no lean stands upright."""
+
+
+@dataclass(frozen=True)
+class Axis:
+    """A straight, nearly upright axis: x = x_m + slope_x · (height − height_m), y likewise."""
+
+    x_m: float
+    y_m: float
+    height_m: float
+    slope_x: float
+    slope_y: float
+    radius_m: float
+    residual_m: float
+    """Root mean square distance of the returns from the cylinder."""
+
+    @property
+    def lean_deg(self) -> float:
+        """Returns the angle from the vertical (degrees)."""
+        return math.degrees(math.atan(math.hypot(self.slope_x, self.slope_y)))
+
+    def at(self, height_m: npt.ArrayLike) -> tuple[Float64, Float64]:
+        """Returns x and y of the axis at heights (any shape)."""
+        past = np.asarray(height_m, np.float64) - self.height_m
+        return self.x_m + self.slope_x * past, self.y_m + self.slope_y * past
+
+
+def fit_axis(xyh: Float64, sensor_xy: Float64, *, lean: bool = True) -> Axis:
+    """Returns the cylinder through returns (n, 3), seen from (n, 2).
+
+    Sight lines meet a cylinder evenly across its width, so the spread of the returns across their sight lines shows the
+    radius, and the middle of that spread the axis across them; along them the axis lies where the returns are one
+    radius away from it (Gauss–Newton, Huber weights). A circle fit alone shows neither for shafts as thin as the range
+    noise; it is what remains where it is not known from where they were seen, as in clouds without a trajectory.
+
+    sensor_xy : NaN where it is not known.
+    lean : the axis may lean; otherwise it is upright.
+    """
+    seen = np.isfinite(sensor_xy[:, 0])
+    if np.count_nonzero(seen) < _LEAST_SEEN:
+        return _round_axis(xyh, lean)
+    xyh, sensor_xy = xyh[seen], sensor_xy[seen]
+    middle = median(xyh[:, 2])
+    sight = sensor_xy - xyh[:, :2]
+    sight /= np.maximum(np.hypot(sight[:, 0], sight[:, 1]), 1e-9)[:, None]
+    sector = np.floor(np.degrees(np.arctan2(sight[:, 1], sight[:, 0])) / SECTOR_DEG).astype(np.int64)
+    order = np.argsort(sector, kind="stable")
+    table = np.ascontiguousarray(np.column_stack([xyh[:, :2], xyh[:, 2] - middle, sight])[order])
+    state = np.array([median(xyh[:, 0]), median(xyh[:, 1]), 0.0, 0.0, 0.03])
+    residual, _ = fit_cylinder(table, sector[order], lean, state, np.empty((len(table), 4)))
+    x, y, slope_x, slope_y, radius = map(float, state)
+    return Axis(x, y, middle, slope_x, slope_y, radius, float(residual))
+
+
+def _round_axis(xyh: Float64, lean: bool) -> Axis:
+    """Returns the cylinder that returns (n, 3) lie on: distances from it count by a soft L1 norm."""
+    from scipy.optimize import least_squares
+
+    middle = float(np.median(xyh[:, 2]))
+    centre = np.median(xyh[:, :2], axis=0)
+    past = xyh - [*centre, middle]
+
+    def misses(state: Float64) -> Float64:
+        x, y, slope_x, slope_y, radius = state
+        away = np.hypot(past[:, 0] - x - slope_x * past[:, 2], past[:, 1] - y - slope_y * past[:, 2])
+        return np.asarray(np.append(away - radius, math.sqrt(len(past)) * _STIFF_M * np.array([slope_x, slope_y])))
+
+    most = np.array([1.0, 1.0, *[1.0 if lean else 1e-9] * 2, MOST_RADIUS_M])
+    least = np.append(-most[:4], LEAST_RADIUS_M)
+    spread = math.sqrt(past[:, :2].var(axis=0).sum())
+    begin = [0.0, 0.0, 0.0, 0.0, min(max(spread, 2.0 * LEAST_RADIUS_M), 0.9 * MOST_RADIUS_M)]
+    fit = least_squares(misses, begin, loss="soft_l1", f_scale=_NOISE_M, bounds=(least, most))
+    x, y, slope_x, slope_y, radius = map(float, fit.x)
+    return Axis(float(centre[0]) + x, float(centre[1]) + y, middle, slope_x, slope_y, radius,
+                float(np.sqrt(np.mean(np.square(misses(fit.x)[:-2])))))  # fmt: skip
+
 
 _LEAST_SLICES: Final = 3
 """Least number of slices of 0.2 m in which a shaft shows."""
@@ -144,7 +235,7 @@ def _scores(slices: Slices) -> Int64:
     return scores
 
 
-def _members(slices: Slices, near: Int64, seed: int, used: npt.NDArray[np.bool_]) -> Int64:
+def _members(slices: Slices, near: Int64, seed: int, used: Bool) -> Int64:
     """Components of a shaft about a seed: near a straight axis, in slices without long gaps; none if too few."""
     near = near[~used[near]]
     kept = np.empty(near.size, np.bool_)
@@ -175,7 +266,7 @@ def _measured(scene: Scene, slices: Slices, members: Int64, rows: Int64, alone: 
     )  # fmt: skip
 
 
-def _narrow(xyh: Float64) -> npt.NDArray[np.bool_]:
+def _narrow(xyh: Float64) -> Bool:
     """Returns a mask (n,) of the slices' returns where the shaft is narrow: plates, lamps and crowns are wider."""
     level = np.floor(xyh[:, 2] / SLICE_M).astype(np.int64)
     level -= int(level.min())
@@ -184,7 +275,7 @@ def _narrow(xyh: Float64) -> npt.NDArray[np.bool_]:
     if np.isfinite(widths).sum() < 3:
         return np.ones(len(xyh), np.bool_)
     limit = 1.4 * float(np.nanquantile(widths, 0.3)) + 0.06
-    narrow: npt.NDArray[np.bool_] = ~(widths[level] > limit)
+    narrow: Bool = ~(widths[level] > limit)
     return narrow
 
 
@@ -207,3 +298,113 @@ def _surroundings() -> tuple[Float64, Int64]:
     """Returns the distance (21, 21) of cells from the middle one (m), up to a metre, and their direction of eight."""
     dy, dx = np.mgrid[-10:11, -10:11] * CELL_M
     return np.hypot(dx, dy), (np.floor(np.arctan2(dy, dx) / (np.pi / 4)).astype(np.int64) + 8) % 8
+
+
+_SWEEP_NS: Final = 100_000_000
+"""Returns within this time (ns) share the error of their pose."""
+_SKIN_M: Final = 0.1
+"""Returns so near to a shaft's surface (m) tell of its axis."""
+_POSE_M, _POSE_SWEEPS = 0.015, 2.0
+"""1 σ of the place of one sweep against another (m) after registration or adjustment, and the number of sweeps that it
+counts as: one sweep alone cannot show its own error."""
+_ROUND: Final = 0.1
+"""1 σ of a trunk's or post's radius over directions, as a share of it: stems are out of round, and bark
+and twigs add to them."""
+_PARTS: Final = 6
+"""Parts of a shaft, one above the other, that are left out in turn where nothing else tells its σ."""
+_UNSEEN: Final = 0.25
+"""1 σ of a radius by its circle alone, as a share of it: on the labelled street, diameters from a cloud without a
+trajectory differ so much (RMS) from those with it."""
+_LEAST_M: Final = 0.003
+"""Least σ (m): coordinates are millimetres, ranges are stated in steps of 2 mm or more."""
+_LEAST_OF_SLICE: Final = 3
+"""Slices with fewer returns tell of no middle and no width."""
+
+
+class Sigma(NamedTuple):
+    """1 σ (m)."""
+
+    place_m: float
+    """Of the foot, east and north, each."""
+    radius_m: float
+
+
+def sigma_of(scene: Scene, shaft: Shaft) -> Sigma:
+    """Returns the standard deviations of the foot and the radius of a shaft.
+
+    Variances add up of: the mean of the sweeps, from their scatter; the mean of the slices, as bark, branches and the
+    noise of ranges move them, carried down to the foot with the error of the lean; and along the sight lines that of
+    the radius, by which the axis lies behind the surface that was seen. Where it is not known from where it was seen,
+    the fits without one part in six each tell both (jackknife: Tukey 1958).
+    """
+    returns, axis = scene.returns, shaft.axis
+    height = returns.height_m[shaft.rows]
+    x, y = axis.at(height)
+    past = np.stack([returns.x_m[shaft.rows] - x, returns.y_m[shaft.rows] - y])
+    rows = shaft.rows[np.hypot(*past) < axis.radius_m + _SKIN_M]
+    if rows.size < _LEAST_OF_SLICE:
+        return Sigma(_POSE_M + axis.radius_m, max(axis.radius_m, _LEAST_M))
+    if not np.isfinite(returns.sensor_x_m[rows]).all():
+        return _of_parts(np.column_stack([returns.x_m[rows], returns.y_m[rows], returns.height_m[rows]]), shaft)
+    height = returns.height_m[rows]
+    x, y = axis.at(height)
+    past = np.stack([returns.x_m[rows] - x, returns.y_m[rows] - y])
+    sight = np.stack([returns.sensor_x_m[rows] - x, returns.sensor_y_m[rows] - y])
+    sight /= np.maximum(np.hypot(*sight), 1e-9)
+    along = past[0] * sight[0] + past[1] * sight[1]
+    across = past[1] * sight[0] - past[0] * sight[1]
+    along -= np.sqrt(np.maximum(axis.radius_m**2 - across**2, 0.04 * axis.radius_m**2))
+    off = np.stack([along * sight[0] - across * sight[1], along * sight[1] + across * sight[0]])
+    sweeps, pose = _of_sweeps(off, returns.epoch_gps_ns[rows] // _SWEEP_NS)
+    mean, foot = _of_slices(off, height, axis.height_m, shaft.ground_m)
+    radius = _of_radius(across, height, axis.radius_m, pose, sweeps)
+    behind = float(np.hypot(*sight.mean(axis=1)))  # 1: seen from one side, 0: from all
+    place = pose**2 / sweeps + mean**2 + foot**2 + 0.5 * (behind * radius) ** 2
+    return Sigma(max(math.sqrt(place), _LEAST_M), max(radius, _LEAST_M))
+
+
+def _of_parts(xyh: Float64, shaft: Shaft) -> Sigma:
+    """Returns the standard deviations of a shaft from fits to all parts of its returns (n, 3) but one each."""
+    xyh = xyh[np.argsort(xyh[:, 2], kind="stable")]
+    part = np.arange(len(xyh)) * _PARTS // len(xyh)
+    fits = [fit_axis(held, np.full((len(held), 2), np.nan), lean=float(np.ptp(held[:, 2])) > LEANING_M)
+            for k in range(_PARTS) if len(held := xyh[part != k]) > _LEAST_OF_SLICE]  # fmt: skip
+    of_each = np.array([[*map(float, fit.at(shaft.ground_m)), fit.radius_m] for fit in fits])
+    spread = np.sqrt((len(fits) - 1) * of_each.var(axis=0))
+    radius = math.hypot(spread[2], _UNSEEN * shaft.axis.radius_m)
+    return Sigma(max(math.hypot(spread[0], spread[1], radius, _POSE_M) / math.sqrt(2.0), _LEAST_M), radius)
+
+
+def _of_sweeps(off: Float64, sweep: Int64) -> tuple[int, float]:
+    """Returns how many sweeps saw a shaft, and 1 σ of the place of one of them."""
+    _, number = np.unique(sweep, return_inverse=True)
+    count = np.bincount(number)
+    square = sum((np.bincount(number, weights=v) ** 2 / count).sum() for v in off) / (2.0 * sweep.size)
+    known = count.size - 1.0
+    total = square * count.size + _POSE_SWEEPS * _POSE_M**2
+    return count.size, math.sqrt(total / (known + _POSE_SWEEPS))
+
+
+def _of_slices(off: Float64, height: Float64, middle_m: float, ground_m: float) -> tuple[float, float]:
+    """Returns 1 σ of the axis at its middle height, and of its way down to the ground, from the scatter of slices."""
+    level = np.floor((height - height.min()) / SLICE_M).astype(np.int64)
+    count = np.bincount(level)
+    some = count >= _LEAST_OF_SLICE
+    slices = int(np.count_nonzero(some))
+    if slices < 3:
+        scatter = float(np.sqrt((off**2).mean()))
+        return scatter / math.sqrt(max(slices, 1)), 0.5 * scatter
+    means = [np.bincount(level, weights=v)[some] / count[some] for v in off]
+    scatter = math.sqrt(sum(float(np.square(v).sum()) for v in means) / (2.0 * (slices - 2)))
+    heights = height.min() + (np.flatnonzero(some) + 0.5) * SLICE_M
+    lever = (heights.mean() - ground_m) / math.sqrt(float(np.square(heights - heights.mean()).sum()))
+    return scatter / math.sqrt(slices), scatter * lever
+
+
+def _of_radius(across: Float64, height: Float64, radius_m: float, pose_m: float, sweeps: int) -> float:
+    """Returns 1 σ of the radius, from the widths that slices show."""
+    level = np.floor((height - height.min()) / SLICE_M).astype(np.int64)
+    halves = [0.5 * float(np.ptp(across[level == k])) for k in np.unique(level).tolist()
+              if np.count_nonzero(level == k) >= _LEAST_OF_SLICE]  # fmt: skip
+    scatter = float(np.std(halves)) / math.sqrt(len(halves)) if len(halves) >= 3 else 0.5 * radius_m
+    return math.sqrt(scatter**2 + (_ROUND * radius_m) ** 2 + 0.5 * pose_m**2 / sweeps)

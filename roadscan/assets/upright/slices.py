@@ -1,7 +1,8 @@
-"""Compact components of horizontal slices: the cross-sections of shafts."""
+"""Horizontal slices of a scene: compact components, the cross-sections of shafts; and an index of returns by place."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -10,11 +11,33 @@ import numpy.typing as npt
 
 from roadscan.assets import classes
 from roadscan.assets.bins import in_bins
-from roadscan.assets.kernels.slices import fill_slices
-from roadscan.assets.memory import once_a_scene
-from roadscan.assets.scene import Scene
-from roadscan.assets.touching import touching
-from roadscan.compute.array_types import Float64, Int64
+from roadscan.assets.kernels.buckets import count_buckets, fill_buckets
+from roadscan.assets.kernels.shafts import fill_slices
+from roadscan.assets.scene import Box, Returns, Scene, once_a_scene
+from roadscan.compute.array_types import Bool, Float64, Int64
+
+
+def touching(flat: Int64, steps: Iterable[int]) -> npt.NDArray[np.int32]:
+    """Returns the number (n,) of the connected piece of each cell.
+
+    Parameters
+    ----------
+    flat : (n,) numbers of the cells, ascending, each once: rows and layers apart so far that no step leaves them.
+    steps : differences of the numbers of cells that touch, those that are positive.
+    """
+    from scipy import sparse
+    from scipy.sparse.csgraph import connected_components
+
+    edges = [np.empty((0, 2), np.int64)]
+    for step in steps:
+        at = np.searchsorted(flat, flat + step)
+        met = (at < flat.size) & (flat[np.minimum(at, flat.size - 1)] == flat + step)
+        edges.append(np.column_stack([np.flatnonzero(met), at[met]]))
+    joined = np.concatenate(edges)
+    graph = sparse.coo_matrix((np.ones(len(joined), np.int8), (joined[:, 0], joined[:, 1])), shape=(flat.size,) * 2)
+    label: npt.NDArray[np.int32] = connected_components(graph, directed=False)[1]
+    return label
+
 
 CELL_M: Final = 0.1  # Edge of a cell (m).
 SLICE_M: Final = 0.2  # Height of a slice (m).
@@ -54,7 +77,7 @@ class Slices:
 
 
 @once_a_scene
-def usable(scene: Scene) -> npt.NDArray[np.bool_]:
+def usable(scene: Scene) -> Bool:
     """Returns a mask (n,) of the returns that may belong to something upright: no ground, vehicles, people or noise."""
     lookup = np.ones(256, np.bool_)
     lookup[list(SET_APART)] = False
@@ -103,3 +126,61 @@ def around(slices: Slices, x_m: float, y_m: float, reach_m: float) -> npt.NDArra
     return slices.counts[
         :, max(row - reach, 0) : max(row + reach + 1, 0), max(column - reach, 0) : max(column + reach + 1, 0)
     ]
+
+
+_CELL_M: Final = 1.0  # Edge of a cell (m).
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Returns that may belong to something upright, sorted by cells of a metre."""
+
+    window: Box
+    returns: Returns
+    """Those of the scene, which is not referenced: the cache would keep it in memory."""
+    rows: Int64
+    x_m: Float64
+    """Places of these rows."""
+    y_m: Float64
+    starts: Int64
+    shape: tuple[int, int]
+
+    def within(self, x_m: float, y_m: float, reach_m: float) -> Int64:
+        """Returns the returns within reach of a place, seen from above, in order of their number."""
+        window = self.window
+        u, v = (x_m - window.x_min_m) / _CELL_M, (y_m - window.y_min_m) / _CELL_M
+        reach = reach_m / _CELL_M
+        first, last = max(int(u - reach), 0), min(int(u + reach), self.shape[1] - 1)
+        parts = [np.zeros(0, np.int64)]
+        for row in range(max(int(v - reach), 0), min(int(v + reach), self.shape[0] - 1) + 1):
+            if last >= first:
+                begin = row * self.shape[1]
+                some = slice(self.starts[begin + first], self.starts[begin + last + 1])
+                near = (self.x_m[some] - x_m) ** 2 + (self.y_m[some] - y_m) ** 2 <= reach_m**2
+                parts.append(self.rows[some][near])
+        return np.sort(np.concatenate(parts))
+
+
+@once_a_scene
+def places_of(scene: Scene) -> Places:
+    """Returns the index of a scene's returns without ground, vehicles, people and noise."""
+    window, returns = scene.window, scene.returns
+    rows = int(np.ceil((window.y_max_m - window.y_min_m) / _CELL_M - 1e-9))
+    columns = int(np.ceil((window.x_max_m - window.x_min_m) / _CELL_M - 1e-9))
+    corner = np.array([window.x_min_m, window.y_min_m])
+    counted = usable(scene)
+    starts = np.zeros(rows * columns + 1, np.int64)
+    count_buckets(returns.x_m, returns.y_m, counted, corner, _CELL_M, (rows, columns), starts)
+    order = np.empty(int(starts[-1]), np.int64)
+    fill_buckets(returns.x_m, returns.y_m, counted, corner, _CELL_M, (rows, columns), starts.copy(), order)
+    return Places(window, returns, order, returns.x_m[order], returns.y_m[order], starts, (rows, columns))
+
+
+@once_a_scene
+def ground_light(scene: Scene) -> float:
+    """Returns the median intensity of the ground of the survey; infinite where there is none."""
+    light = scene.statistics.known("ground_light")
+    if light is not None:
+        return light
+    ground = (scene.classes == classes.GROUND) | (scene.classes == classes.ROAD)
+    return float(np.median(scene.returns.intensity[ground])) if ground.any() else float("inf")

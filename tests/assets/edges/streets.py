@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from roadscan.assets.returns import Returns
+from roadscan.assets.scene import Returns
 
 Array = np.ndarray[Any, Any]
 

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from benchmarks.street_scores import SIDEWALK, TERRAIN, labelled_edges, points_along, share_within
 from roadscan.assets import classes
 from roadscan.assets.edges.find import edges_of_raster
-from roadscan.assets.edges.raster import of_cells
+from roadscan.assets.edges.steps import of_cells
 from roadscan.assets.kind import AssetObject
 from roadscan.assets.kinds.kerb import Kerb, KerbOptions
 from roadscan.assets.make_scene import make_scene

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from roadscan.assets.kinds.clearance import ClearanceOptions
 from roadscan.assets.kinds.shoulder import ShoulderOptions
-from roadscan.assets.upright.overhead import ClearanceOptions
-from roadscan.assets.upright.plates import SignOptions
+from roadscan.assets.kinds.sign import SignOptions
 from roadscan.core.errors import ConfigError
 from roadscan.core.strict import Strict
 

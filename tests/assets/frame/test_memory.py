@@ -10,8 +10,7 @@ import pytest
 
 from roadscan.assets.kind import asset_kinds
 from roadscan.assets.make_scene import make_scene
-from roadscan.assets.returns import Returns
-from roadscan.assets.scene import Box
+from roadscan.assets.scene import Box, Returns
 
 
 @pytest.mark.nightly

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import shapely
 
-from roadscan.assets.kind import AssetObject
-from roadscan.assets.object_table import object_names, objects_of_table, reference_point, table_of_objects
+from roadscan.assets.kind import AssetObject, object_names, objects_of_table, reference_point, table_of_objects
 from roadscan.store.asset_schema import asset_kind_names, asset_schema, asset_tables
 from roadscan.store.schema import schema_names
 

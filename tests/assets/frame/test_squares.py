@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from roadscan.assets.ground.settings import GroundSettings
 from roadscan.assets.kind import asset_kinds
 from roadscan.assets.make_scene import CLASSES_REACH_M
-from roadscan.assets.settings import AssetsConfig
-from roadscan.assets.tasks.along_roads import along_roads
+from roadscan.assets.settings import AssetsConfig, GroundSettings
 from roadscan.assets.tasks.load_returns import _Columns, in_order
 from roadscan.assets.tasks.objects import clustered
 from roadscan.assets.tasks.plan import halos_of
+from roadscan.assets.tasks.tables import along_roads
 from roadscan.assets.tiling import AssetGrid, Halos
 from roadscan.condition.road_line import Lane, RoadLine
 from roadscan.condition.tasks.lines import Roads

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.assets.statistics import Statistics, together
+from roadscan.assets.scene import Statistics, together
 
 
 def test_samples_together_tell_the_quantile_of_all_their_values() -> None:

@@ -6,11 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from roadscan.assets.pictures.colour_classes import colour_of, hue_saturation_value
-from roadscan.assets.pictures.paint_colours import paint_colour
-from roadscan.assets.pictures.plate_outlines import plate_outline
-from roadscan.assets.pictures.plate_shapes import plate_odds, shape_of
 from roadscan.assets.pictures.reader import CutOut
+from roadscan.assets.pictures.readers.paint import paint_colour
+from roadscan.assets.pictures.readers.sign import colour_of, hue_saturation_value, plate_odds, plate_outline, shape_of
 
 PAINTS = {
     "red": (190, 30, 36), "blue": (20, 66, 160), "yellow": (248, 200, 24), "green": (12, 118, 62),

@@ -6,12 +6,11 @@ import numpy as np
 import shapely
 
 from roadscan.assets import classes
-from roadscan.assets.kernels.sight_lines import find_hidden
+from roadscan.assets.kernels.sight import find_hidden
 from roadscan.assets.kind import AssetObject
 from roadscan.assets.pictures.reader import sight_of
-from roadscan.assets.returns import Returns
-from roadscan.assets.scene import Box, GroundModel, Scene
-from roadscan.assets.screens import ALWAYS, EDGE_M, screens_of
+from roadscan.assets.scene import Box, GroundModel, Returns, Scene
+from roadscan.assets.visibility import ALWAYS, EDGE_M, screens_of
 
 CORNER = (1000.0, 2000.0)
 WALKED = np.array([0.0, 0.0, 0.25])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.assets.upright.attachments import _reach
+from roadscan.assets.upright.standing import _reach
 
 
 @pytest.mark.parametrize("count", [10, 12])

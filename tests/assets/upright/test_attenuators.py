@@ -7,7 +7,7 @@ import pytest
 import shapely
 
 from roadscan.assets.kind import AssetObject, asset_kinds
-from roadscan.assets.upright.cushions import PIECE_SCHEMA
+from roadscan.assets.kinds.attenuator import PIECE_SCHEMA
 
 
 def line(*xy: tuple[float, float]) -> AssetObject:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from roadscan.assets.upright.axis_sigma import sigma_of
+from roadscan.assets.upright.shafts import sigma_of
 from roadscan.assets.upright.standing import uprights_of
 from tests.assets.upright.scene import simulated
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from roadscan.assets import classes
-from roadscan.assets.returns import Returns
-from roadscan.assets.scene import Box, GroundModel, Scene
+from roadscan.assets.scene import Box, GroundModel, Returns, Scene
 from roadscan.assets.upright.brightness import brightness
 
 

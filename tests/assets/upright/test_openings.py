@@ -9,11 +9,10 @@ import numpy.typing as npt
 import pytest
 
 from roadscan.assets import classes
-from roadscan.assets.returns import Returns
-from roadscan.assets.scene import Box, GroundModel, Scene
+from roadscan.assets.kinds.surfaces import told
+from roadscan.assets.scene import Box, GroundModel, Returns, Scene
 from roadscan.assets.upright.lines import chain_of
 from roadscan.assets.upright.panels import panels_of
-from roadscan.assets.upright.surfaces import told
 
 Float64 = npt.NDArray[np.float64]
 _LONG_M = 12.0

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from roadscan.assets.kinds.sign import SignOptions, plates_of
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.scene import Box
-from roadscan.assets.upright.plates import SignOptions, plates_of
 from roadscan.simulate.scene import Scene as StreetScene
 from roadscan.simulate.things import objects_table
 from tests.assets.streets import street

@@ -11,7 +11,7 @@ from benchmarks.labelled_street import labelled_street, recording_folder
 from benchmarks.street_scores import BUILDING, POLE, SIGN, TRUNK, poles_and_trunks, share_of_class, things
 from roadscan.assets import classes
 from roadscan.assets.kind import asset_kinds
-from roadscan.assets.upright.plates import SignOptions, plates_of
+from roadscan.assets.kinds.sign import SignOptions, plates_of
 from roadscan.assets.upright.standing import Upright, uprights_of
 from tests.assets.scenes import NOT_JUDGED, semantic_kitti_scene
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.assets.upright.grown import area_of, components
-from roadscan.assets.upright.outlines import outline_of
+from roadscan.assets.kinds.landscape_area import area_of, components
+from roadscan.assets.upright.plate_outlines import outline_of
 
 
 def inside(shape: str, points: np.ndarray) -> np.ndarray:

@@ -8,8 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from roadscan.assets.kind import AssetObject, asset_kinds
-from roadscan.assets.object_table import object_names
+from roadscan.assets.kind import AssetObject, asset_kinds, object_names
 from tests.assets.upright.scene import objects_of, simulated
 
 SHAFTS = ("pole", "lamp_post", "tree", "sign", "signal")

@@ -9,9 +9,9 @@ import pyarrow as pa
 import pytest
 
 from roadscan.assets.kind import AssetObject, asset_kinds
+from roadscan.assets.kinds.surfaces import parts_of
 from roadscan.assets.scene import Box, Scene
 from roadscan.assets.upright.lines import PIECE_SCHEMA, STRETCHES, Chain, chains_of
-from roadscan.assets.upright.surfaces import parts_of
 from tests.assets.upright.scene import objects_of, simulated
 
 TILE_M, HALO_M = 20.0, 8.0

@@ -1,1 +1,1 @@
-"""Readers of the pictures of a kind of assets, one file a kind."""
+"""Readers of the pictures of kinds of assets."""

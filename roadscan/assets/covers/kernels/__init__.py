@@ -1,1 +1,0 @@
-"""Kernels of spots on the ground."""

@@ -1,1 +1,0 @@
-"""Street furniture: what stands compactly on the ground, and its features."""

@@ -1,1 +1,0 @@
-"""Loops over boosted trees."""

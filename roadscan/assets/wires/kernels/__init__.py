@@ -1,1 +1,0 @@
-"""Kernels of lines through cubes of returns."""

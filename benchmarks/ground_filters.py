@@ -21,7 +21,7 @@ import numpy.typing as npt
 from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import Delaunay
 
-from roadscan.assets.ground.surface import filled, opened
+from roadscan.assets.ground.surface import Grid, filled, opened
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
@@ -43,9 +43,10 @@ class Sample:
         np.minimum.at(lowest, self.cell, points[:, 2])
         self.known = np.isfinite(lowest)
         self.lowest_m: Float32 = lowest.astype(np.float32)
-        whole = filled(self.lowest_m, self.known)
+        self.grid = Grid(0.0, 0.0, 1.0, *lowest.shape)
+        whole = filled(self.lowest_m, self.known, self.grid)
         self.known &= -whole - opened(-whole, 1) <= _PIT_M
-        self.surface_m = filled(self.lowest_m, self.known)
+        self.surface_m = filled(self.lowest_m, self.known, self.grid)
 
     @functools.cached_property
     def sound(self) -> Bools:
@@ -63,7 +64,7 @@ def smrf(sample: Sample, *, slope: float, window_m: float, threshold_m: float, s
     stands = np.zeros(sample.known.shape, np.bool_)
     for radius in range(1, round(window_m) + 1):
         stands |= sample.opened(radius - 1) - sample.opened(radius) > slope * radius
-    ground = filled(sample.lowest_m, sample.known & ~stands)
+    ground = filled(sample.lowest_m, sample.known & ~stands, sample.grid)
     steepness = np.hypot(*np.gradient(ground))
     above = np.abs(sample.points[:, 2] - sampled(ground, sample.points))
     return np.asarray(above <= threshold_m + scaling * sampled(steepness, sample.points))

@@ -82,8 +82,9 @@ class Returns:
 
     def at(self, rows: Bool | npt.NDArray[np.integer[Any]]) -> Self:
         """Returns the returns at `rows`, a mask (n,) or indices."""
+        chosen = np.flatnonzero(rows) if rows.dtype == np.bool_ else rows  # of a mask each column would seek them anew
         arrays: dict[str, Any] = {
-            f.name: v[rows] for f in fields(self) if isinstance(v := getattr(self, f.name), np.ndarray)
+            f.name: v[chosen] for f in fields(self) if isinstance(v := getattr(self, f.name), np.ndarray)
         }
         return replace(self, **arrays)
 

@@ -187,9 +187,23 @@ def test_holes_are_filled_by_a_membrane() -> None:
     harmonic = 0.002 * (x * x - y * y) + 0.05 * x
     known = np.ones(x.shape, np.bool_)
     known[20:45, 30:60] = False
-    wrong = np.abs(filled(np.where(known, harmonic, 0.0).astype(np.float32), known) - harmonic)
+    grid = Grid(0.0, 0.0, 1.0, 60, 80)
+    wrong = np.abs(filled(np.where(known, harmonic, 0.0).astype(np.float32), known, grid) - harmonic)
     assert wrong[known].max() == 0.0
     assert wrong.max() < 0.01 * np.ptp(harmonic[20:45, 30:60])
+
+
+def test_holes_are_filled_alike_in_any_part_of_the_map() -> None:
+    draw = np.random.default_rng(5)
+    y, x = np.mgrid[0:320, 0:320]
+    height = (0.02 * x + np.sin(0.05 * y) + draw.normal(0.0, 0.05, x.shape)).astype(np.float32)
+    known = (draw.random(x.shape) < 0.02) & (np.hypot(x - 150, y - 170) > 25)  # one hole is 25 m wide
+    found = filled(height, known, Grid(0.0, 0.0, 0.5, 320, 320))
+    for first in (24, 36, 61):  # parts whose corners lie anywhere, also between cells of coarser levels
+        part = (slice(first, 290), slice(first + 7, 300))
+        grid = Grid(0.5 * (first + 7), 0.5 * first, 0.5, 290 - first, 293 - first)
+        apart = np.abs(filled(height[part], known[part], grid) - found[part])
+        assert apart[90:-90, 90:-90].max() < 1e-6
 
 
 def test_without_returns_nothing_is_known() -> None:

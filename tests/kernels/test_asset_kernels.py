@@ -91,10 +91,14 @@ def test_holes_are_filled_from_the_means_of_two_by_two_and_relax_to_a_harmonic_s
     z = np.array([[1.0, 3.0, 7.0], [9.0, 0.0, 5.0]], np.float32)
     known = np.array([[True, True, True], [False, False, True]])
     coarse, coarse_known = np.empty((1, 2), np.float32), np.empty((1, 2), np.bool_)
-    halved(z, known, coarse, coarse_known)
+    halved(z, known, (0, 0), coarse, coarse_known)
     assert coarse.tolist() == [[2.0, 6.0]] and coarse_known.all()
-    begin(coarse, known, z)
+    begin(coarse, known, (0, 0), z)
     assert z[1].tolist() == [2.0, 3.0, 5.0]  # a quarter of the way to the next middle
+    halved(z, known, (0, 1), coarse, coarse_known)
+    assert coarse.tolist() == [[1.0, 5.0]]  # the first column is the second of its two by two
+    begin(coarse, known, (0, 1), z)
+    assert z[1].tolist() == [2.0, 4.0, 5.0]
     column, row = np.meshgrid(np.arange(9.0), np.arange(9.0))
     saddle = (column - 4) * (row - 4)  # the mean of its four neighbours everywhere
     inner = np.ones((9, 9), np.bool_)

@@ -87,7 +87,7 @@ def test_sight_lines_through_a_rectangle() -> None:
     rectangle, bands = np.array([[0.0, 5.0, 4.0, 5.0]]), np.array([[[1.0, 2.0], [2.5, 9.0]]])
     ends = np.array([[2.0, 10.0, 1.0], [2.0, 10.0, 4.0], [2.0, 4.0, 1.5], [9.0, 10.0, 1.5], [2.0, 5.1, 1.5]])
     passed = np.zeros((1, 4, 2), np.int64)
-    passing_lines(*ends.T.copy(), np.full(5, 2.0), np.zeros(5), np.full(5, 2.0), rectangle, bands, passed)
+    passing_lines(*ends.T.copy(), np.full(5, 2.0), np.zeros(5), np.full(5, 2.0), rectangle, bands, 7.0, passed)
     assert passed.tolist() == [
         [[0, 0], [0, 0], [1, 1], [0, 0]]
     ]  # at 1.5 and 3 m; the others end before it, beside it, or close behind it

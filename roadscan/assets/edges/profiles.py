@@ -101,7 +101,7 @@ def _own_evidence(place: Float64, quality: Float64, settings: PathSettings) -> f
 
 
 def _bins(places: Places, size_m: float) -> tuple[Int64, Int64, tuple[float, float, float, float, float]]:
-    x_min, y_min = float(places.x_m.min()) - 1e-6, float(places.y_m.min()) - 1e-6
+    x_min, y_min = (size_m * math.floor(float(v.min()) / size_m) for v in (places.x_m, places.y_m))
     column, row = ((places.x_m - x_min) / size_m).astype(np.int64), ((places.y_m - y_min) / size_m).astype(np.int64)
     columns, rows = int(column.max()) + 1, int(row.max()) + 1
     number = row * columns + column
@@ -111,6 +111,8 @@ def _bins(places: Places, size_m: float) -> tuple[Int64, Int64, tuple[float, flo
 
 NODE_M: Final = 0.5
 """Distance of nodes along an edge (m)."""
+_LATTICE_M: Final = 6.0
+"""Edge of the lattice whose crossings are nodes (m)."""
 ALONG_M: Final = 0.5
 """Half the length of a node's window (m): neighbours share half of their heights."""
 SEARCH: Final = (0.2, 0.02, 0.24, 0.35)
@@ -259,19 +261,35 @@ def smooth_line(points: Float64, weight: Float64) -> Float64:
 
 
 def even_nodes(places: Float64, distance_m: float) -> Float64:
-    """Returns points (k, 2) at even distances along places (n, 2), which are smoothed over 0.6 m first."""
-    length = way_along(places)
-    fine = np.arange(0.0, length[-1] + 0.05, 0.1)
-    path = np.column_stack([np.interp(fine, length, places[:, i]) for i in range(2)])
+    """Returns points (k, 2) at about even distances along places (n, 2), which are smoothed over 0.6 m first.
+
+    Nodes lie where the line crosses a lattice of the map, and evenly between: wherever a square lets it begin.
+    """
+    path = _stops(places, 0.1)
     if len(path) >= 3:
         # Mirrored about the end points, which so stay fixed.
         more = min(len(path) - 1, 12)
         before, behind = 2.0 * path[:1] - path[more:0:-1], 2.0 * path[-1:] - path[-2 : -2 - more : -1]
         path = scipy.ndimage.gaussian_filter1d(np.concatenate([before, path, behind]), 3.0, axis=0)[more:-more]
-    length = way_along(path)
-    pieces = max(round(length[-1] / distance_m), 1)
-    at = np.linspace(0.0, length[-1], pieces + 1)
-    return np.column_stack([np.interp(at, length, path[:, i]) for i in range(2)])
+    return _stops(path, distance_m)
+
+
+def _stops(places: Float64, distance_m: float) -> Float64:
+    """Returns points (k, 2) along places (n, 2): both ends, crossings of the lattice, and even ones between these."""
+    length, fixed = way_along(places), []
+    for at in places.T / _LATTICE_M:
+        cell = np.floor(at)
+        k = np.flatnonzero(np.diff(cell))
+        share = (np.maximum(cell[k], cell[k + 1]) - at[k]) / (at[k + 1] - at[k])
+        fixed.append(length[k] + share * (length[k + 1] - length[k]))
+    found = np.sort(np.concatenate(fixed))
+    found = found[np.diff(found, prepend=-np.inf) > distance_m]
+    inner = found[(found > 0.5 * distance_m) & (found < length[-1] - 0.5 * distance_m)]
+    ends = np.concatenate([[0.0], inner, length[-1:]])
+    counts = np.maximum(np.rint(np.diff(ends) / distance_m).astype(np.int64), 1)
+    parts = [np.linspace(*part, n, endpoint=False) for part, n in zip(itertools.pairwise(ends), counts, strict=True)]
+    stops = np.concatenate([*parts, ends[-1:]])
+    return np.column_stack([np.interp(stops, length, places[:, i]) for i in range(2)])
 
 
 def headings(x_m: Float64, y_m: Float64) -> tuple[Float64, Float64]:

@@ -45,15 +45,17 @@ def ground_model(place: Place, found: Found) -> GroundModel:
         middle, scatter = means(sums, middle)
         half = np.maximum(np.float32(_TIMES) * scatter, np.float32(_LEAST_M))
     seen = sums[..., 0] > 0
-    height = filled(found.base.at(grid) + middle, seen)
+    height = filled(found.base.at(grid) + middle, seen, grid)
     away = distances(seen, grid.cell_m)
-    sigma = sigmas(sums[..., 0], scatter, away, place.statistics)
+    sigma = sigmas(sums[..., 0], scatter, away, grid, place.statistics)
     for array in (height, sigma):
         array[(away > place.settings.reach_m) | ~seen.any()] = np.nan
     return GroundModel(grid.x_min_m, grid.y_min_m, grid.cell_m, height, seen, sigma)
 
 
-def sigmas(count: npt.NDArray[np.float64], scatter: Float32, away_m: Float32, statistics: Statistics) -> Float32:
+def sigmas(
+    count: npt.NDArray[np.float64], scatter: Float32, away_m: Float32, grid: Grid, statistics: Statistics
+) -> Float32:
     """Returns 1 σ (rows, columns) of the heights of cells: of a mean where returns were seen, else by distance.
 
     count : returns of each cell; scatter : their standard deviation (m), which few returns underestimate: it is no less
@@ -65,7 +67,7 @@ def sigmas(count: npt.NDArray[np.float64], scatter: Float32, away_m: Float32, st
     usual = np.float32(_UNKNOWN_M if told is None else told)
     single = np.where(several, scatter, np.maximum(scatter, usual))
     mean = (single / np.sqrt(np.maximum(count, 1.0))).astype(np.float32)
-    return np.asarray(np.hypot(filled(mean, seen), np.where(seen, 0.0, _GROWTH * away_m)), np.float32)
+    return np.asarray(np.hypot(filled(mean, seen, grid), np.where(seen, 0.0, _GROWTH * away_m)), np.float32)
 
 
 def means(sums: npt.NDArray[np.float64], middle: Float32) -> tuple[Float32, Float32]:
@@ -131,7 +133,7 @@ def above_planes(place: Place, grid: Grid, on_ground: Bool) -> Found:
     lowest = np.full(grid.shape, np.inf, np.float32)
     x, y, z = returns.x_m, returns.y_m, returns.height_m
     lowest_returns(x[on_ground], y[on_ground], z[on_ground], grid.origin, 1.0 / grid.cell_m, lowest)
-    base = Surface(grid, filled(lowest, np.isfinite(lowest)))
+    base = Surface(grid, filled(lowest, np.isfinite(lowest), grid))
     above = np.empty(len(returns), np.float32)
     heights_above(x, y, z, grid.origin, 1.0 / grid.cell_m, base.height_m, above)
     return Found(base, above, on_ground)

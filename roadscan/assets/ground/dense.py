@@ -151,12 +151,12 @@ def dense_ground(place: Place) -> Found:
     grid = grid_over(place.window, LOWEST_CELL_M)
     lowest = np.full(grid.shape, np.inf, np.float32)
     lowest_returns(x, y, z, grid.origin, 1.0 / grid.cell_m, lowest)
-    surface, known = without_pits(lowest, _PIT_M)
+    surface, known = without_pits(lowest, _PIT_M, grid)
     known &= bare_cells(surface, grid.cell_m, place.settings)
-    base = Surface(grid, filled(lowest, known))
+    base = Surface(grid, filled(lowest, known, grid))
     below = undersides(returns, grid, lowest, base.height_m) & known
     if below.any():
-        base = Surface(grid, filled(lowest, known & ~below))
+        base = Surface(grid, filled(lowest, known & ~below, grid))
     fine, above = grid_over(place.window, _CELL_M), np.empty(x.size, np.float32)
     sums = np.zeros((*fine.shape, 5))
     limits = np.array([*_NEAR_M, _CLOSE_M])

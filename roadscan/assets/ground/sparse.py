@@ -92,9 +92,9 @@ def sparse_ground(place: Place, rules: SparseRules = RULES) -> Found:
     grid = grid_over(seen_part(place), CELL_M)
     lowest = np.full(grid.shape, np.inf, np.float32)
     lowest_returns(x, y, z, grid.origin, 1.0 / grid.cell_m, lowest)
-    surface, known = without_pits(lowest, _PIT_M)
+    surface, known = without_pits(lowest, _PIT_M, grid)
     known &= bare_cells(surface, grid.cell_m, place.settings)
-    first = near(place, smoothed(Surface(grid, filled(lowest, known))), rules, _CLOSE)
+    first = near(place, smoothed(Surface(grid, filled(lowest, known, grid))), rules, _CLOSE)
     found = near(place, smoothed(remade(place, first)), rules, 1.0)
     sure = found.on_ground & (np.abs(found.above_m) <= _TOLERANCE_M)
     wider = with_crests(place, grid, surface, sure, rules.drop_m)
@@ -142,4 +142,4 @@ def remade(place: Place, found: Found) -> Surface:
     cell_heights(x, y, found.above_m, found.on_ground, grid.origin, 1.0 / grid.cell_m, middle, wide, sums)
     seen = sums[..., 0] > 0
     mean = np.divide(sums[..., 1], sums[..., 0], out=np.zeros(grid.shape), where=seen)
-    return Surface(grid, filled((found.base.height_m + mean).astype(np.float32), seen))
+    return Surface(grid, filled((found.base.height_m + mean).astype(np.float32), seen, grid))

@@ -20,22 +20,9 @@ from roadscan.assets.settings import GroundSettings
 from roadscan.compute.array_types import Bool, Float32
 from roadscan.core.extras import cv2
 
-
-def filled(height_m: Float32, known: Bool) -> Float32:
-    """Returns heights (rows, columns), the unknown ones on a membrane through the known ones; 0 if none is known.
-
-    height_m : (rows, columns), read where `known` is True.
-    """
-    z = np.where(known, height_m, np.float32(0.0)).astype(np.float32)
-    if known.all() or min(z.shape) == 0:
-        return z
-    if max(z.shape) > 1:
-        shape = (z.shape[0] + 1) // 2, (z.shape[1] + 1) // 2
-        coarse, coarse_known = np.empty(shape, np.float32), np.empty(shape, np.bool_)
-        halved(z, known, coarse, coarse_known)
-        begin(filled(coarse, coarse_known), known, z)
-        relax(z, known)
-    return z
+_COARSEST_M, _COARSEST = 8.0, 16
+"""Holes are filled from cells of this edge (m) on, or of so many cells where that is more: 16 m for returns from the
+air, between which whole buildings lie."""
 
 
 def distances(found: Bool, cell_m: float) -> Float32:
@@ -64,6 +51,11 @@ class Grid(NamedTuple):
         return self.rows, self.columns
 
     @property
+    def corner(self) -> tuple[int, int]:
+        """Returns row and column of the first cell, counted from the place from which coordinates count."""
+        return round(self.y_min_m / self.cell_m), round(self.x_min_m / self.cell_m)
+
+    @property
     def middles_m(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Returns the middles of the columns (x) and of the rows (y) (m)."""
         x = self.x_min_m + (np.arange(self.columns, dtype=np.float64) + 0.5) * self.cell_m
@@ -75,6 +67,49 @@ def grid_over(window: Box, cell_m: float) -> Grid:
     columns = max(math.ceil((window.x_max_m - window.x_min_m) / cell_m - 1e-9), 1)
     rows = max(math.ceil((window.y_max_m - window.y_min_m) / cell_m - 1e-9), 1)
     return Grid(window.x_min_m, window.y_min_m, cell_m, rows, columns)
+
+
+def filled(height_m: Float32, known: Bool, grid: Grid) -> Float32:
+    """Returns heights (rows, columns), the unknown ones on a membrane through the known ones; 0 if none is known.
+
+    Cells are halved on one lattice of the map, up to an edge of 8 m or 16 cells. In larger holes the heights around go
+    on, ring by ring. So a height depends on what lies up to about twice as far away as the nearest known one, however
+    much of the map is filled at once.
+
+    height_m : (rows, columns), read where `known` is True.
+    """
+    z = np.where(known, height_m, np.float32(0.0)).astype(np.float32)
+    return (
+        z
+        if known.all() or not known.any()
+        else _filled(z, known, grid.corner, max(_COARSEST, round(_COARSEST_M / grid.cell_m)))
+    )
+
+
+def _filled(z: Float32, known: Bool, corner: tuple[int, int], cells: int) -> Float32:
+    if cells <= 1:
+        return _continued(z, known)
+    odd = corner[0] % 2, corner[1] % 2
+    shape = (z.shape[0] + odd[0] + 1) // 2, (z.shape[1] + odd[1] + 1) // 2
+    coarse, coarse_known = np.empty(shape, np.float32), np.empty(shape, np.bool_)
+    halved(z, known, odd, coarse, coarse_known)
+    begin(_filled(coarse, coarse_known, (corner[0] // 2, corner[1] // 2), cells // 2), known, odd, z)
+    relax(z, known)
+    return z
+
+
+def _continued(z: Float32, known: Bool) -> Float32:
+    """Returns heights (rows, columns): ring by ring, each unknown one is the mean of those known beside it."""
+    rows, columns = z.shape
+    while not known.all():
+        sums, number = np.zeros(z.shape), np.zeros(z.shape)
+        wide, held = np.pad(np.where(known, z, 0.0), 1), np.pad(known, 1)
+        for r, c in np.ndindex(3, 3):
+            sums += wide[r : r + rows, c : c + columns]
+            number += held[r : r + rows, c : c + columns]
+        z = np.where(known, z, sums / np.maximum(number, 1.0)).astype(np.float32)
+        known = number > 0
+    return z
 
 
 DENSE_PER_M2: Final = 4
@@ -185,18 +220,18 @@ def objects(surface: Float32, cell_m: float, steepest: float, largest_m: float) 
     return found[margin:-margin, margin:-margin]
 
 
-def without_pits(lowest_m: Float32, pit_m: float) -> tuple[Float32, Bool]:
+def without_pits(lowest_m: Float32, pit_m: float, grid: Grid) -> tuple[Float32, Bool]:
     """Returns the whole surface of the lowest returns without those in pits, and a mask of the cells that it has.
 
     lowest_m : (rows, columns), inf where a cell has no return.
     pit_m : a lowest return is noise where it lies below the surface around by more.
     """
     known = np.isfinite(lowest_m)
-    surface = filled(lowest_m, known)
+    surface = filled(lowest_m, known, grid)
     pits = -surface - opened(-surface, 1) > pit_m
     if (pits & known).any():
         known &= ~pits
-        surface = filled(lowest_m, known)
+        surface = filled(lowest_m, known, grid)
     return surface, known
 
 

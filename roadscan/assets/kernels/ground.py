@@ -202,17 +202,18 @@ across a hole."""
 
 
 @kernel
-def halved(z, known, coarse, coarse_known):
+def halved(z, known, odd, coarse, coarse_known):
     """Compute the mean height of the known cells of each two by two.
 
-    z : (rows, columns) float32; known : (rows, columns) bool; coarse, coarse_known : (⌈rows/2⌉, ⌈columns/2⌉), out.
+    z : (rows, columns) float32; known : (rows, columns) bool. odd : (2,) 1 where the first row, the first column, is
+    the second of its two by two, else 0. coarse, coarse_known : (⌈(rows + odd)/2⌉, ⌈(columns + odd)/2⌉), out.
     """
     rows, columns = z.shape
     for i in range(coarse.shape[0]):
         for j in range(coarse.shape[1]):
             total, count = 0.0, 0
-            for a in range(2 * i, min(2 * i + 2, rows)):
-                for b in range(2 * j, min(2 * j + 2, columns)):
+            for a in range(max(2 * i - odd[0], 0), min(2 * i + 2 - odd[0], rows)):
+                for b in range(max(2 * j - odd[1], 0), min(2 * j + 2 - odd[1], columns)):
                     if known[a, b]:
                         total += z[a, b]
                         count += 1
@@ -221,19 +222,19 @@ def halved(z, known, coarse, coarse_known):
 
 
 @kernel
-def begin(coarse, known, z):
+def begin(coarse, known, odd, z):
     """Fill the unknown cells of z from the coarse level, bilinear between the middles of its cells.
 
-    coarse : (⌈rows/2⌉, ⌈columns/2⌉) float32, whole; known : (rows, columns) bool; z : (rows, columns) float32, changed.
+    coarse : float32, whole; known : (rows, columns) bool; odd : as for :func:`halved`; z : (rows, columns) float32.
     """
     m, n = coarse.shape
     for i in range(z.shape[0]):
-        a = i // 2
-        a2 = min(max(a + (1 if i % 2 else -1), 0), m - 1)
+        a, upper = divmod(i + odd[0], 2)
+        a2 = min(max(a + (1 if upper else -1), 0), m - 1)
         for j in range(z.shape[1]):
             if not known[i, j]:
-                b = j // 2
-                b2 = min(max(b + (1 if j % 2 else -1), 0), n - 1)
+                b, right = divmod(j + odd[1], 2)
+                b2 = min(max(b + (1 if right else -1), 0), n - 1)
                 near = 0.75 * coarse[a, b] + 0.25 * coarse[a, b2]
                 far = 0.75 * coarse[a2, b] + 0.25 * coarse[a2, b2]
                 z[i, j] = 0.75 * near + 0.25 * far

@@ -183,12 +183,13 @@ def near_middles(t, d, stretch, edges, middle, most_m, near):
 
 
 @kernel
-def passing_lines(x, y, height, sensor_x, sensor_y, sensor_height, segments, bands, passed):
+def passing_lines(x, y, height, sensor_x, sensor_y, sensor_height, segments, bands, reach_m, passed):
     """Count the sight lines that cross upright rectangles and end behind them.
 
     x, y, height : (n,) returns; sensor_x, sensor_y, sensor_height : (n,) where they were seen from (m); segments :
     (s, 4) ends x, y and x, y of rectangles seen from above; bands : (s, b, 2) heights of the lower and upper edges of b
-    rectangles above one another; passed : (s, p, b) int64, is added to in each of p equal parts along the rectangles.
+    rectangles above one another; reach_m : lines that end farther from the middle of a rectangle, seen from above, do
+    not count; passed : (s, p, b) int64, is added to in each of p equal parts along the rectangles.
     """
     for s in range(segments.shape[0]):
         ax, ay, bx, by = segments[s, 0], segments[s, 1], segments[s, 2], segments[s, 3]
@@ -197,7 +198,10 @@ def passing_lines(x, y, height, sensor_x, sensor_y, sensor_height, segments, ban
         if length == 0.0:
             continue
         ux, uy = ux / length, uy / length
+        mx, my = 0.5 * (ax + bx), 0.5 * (ay + by)
         for i in range(x.size):
+            if (x[i] - mx) ** 2 + (y[i] - my) ** 2 > reach_m * reach_m:
+                continue
             beyond = ux * (y[i] - ay) - uy * (x[i] - ax)
             before = ux * (sensor_y[i] - ay) - uy * (sensor_x[i] - ax)
             if beyond * before >= 0.0 or abs(beyond) < 0.3:

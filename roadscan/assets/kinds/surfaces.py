@@ -17,7 +17,7 @@ from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
 from roadscan.assets.probabilities import logistic
 from roadscan.assets.scene import Scene, once_a_tile
 from roadscan.assets.upright.lines import PIECE_SCHEMA, Chain, beside, chain_of, chains_of, outline, pieces_of_panels
-from roadscan.assets.upright.panels import panels_of
+from roadscan.assets.upright.panels import SIGHT_M, panels_of
 
 Surface = Literal["facade", "wall", "barrier", "guardrail", "fence"]
 
@@ -146,6 +146,7 @@ class SurfaceKind(AssetKind):
 
     code: ClassVar[int]
     piece_schema = PIECE_SCHEMA
+    reach_m: ClassVar[float] = SIGHT_M + 1.0
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:
         """Pieces of all upright surfaces in the tile; marked are the returns of those that look like this kind."""

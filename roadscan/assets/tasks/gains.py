@@ -20,6 +20,7 @@ from roadscan.assets.settings import GroundSettings
 from roadscan.assets.tasks.load_returns import LoadedSquare, ReturnsTask, load_squares, scene_of
 from roadscan.assets.tasks.plan import AssetPlan, cut_squares, grid_of, readings_of, square_key
 from roadscan.assets.tiling import AssetGrid, Halos
+from roadscan.assets.upright.panels import highest_elevation_deg
 from roadscan.core.grid import TileId
 from roadscan.run.engine.compute import reason_of
 from roadscan.run.keys import code_digest, key_of
@@ -179,6 +180,7 @@ def measured(scene: Scene) -> dict[str, Measured]:
     """Returns the statistics of a scene."""
     raster_of(scene)
     roughness_of_road_m(scene)
+    highest_elevation_deg(scene)
     return scene.statistics.measured
 
 

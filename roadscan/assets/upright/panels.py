@@ -20,8 +20,12 @@ from roadscan.assets.upright.slices import places_of
 from roadscan.compute.array_types import Bool, Float64, Int64
 
 STRETCH_M: Final = 1.0  # Length of a stretch (m), about.
-_MOST_LINES: Final = 150_000
-"""Sight lines that are compared with surfaces: every k-th return, so that there are no more."""
+_LINES_PER_M2: Final = 8.0
+"""About so many sight lines for each square metre of the survey are compared with surfaces."""
+SIGHT_M: Final = 13.0
+"""Lines that end farther from a stretch (m) are not counted: squares of any cut see the others."""
+_HIGHEST: Final = (0.98, 0.95)
+"""The highest beam is at this share of the elevations above that share of all: 0.999 of all lie below."""
 _STRETCH_LEAST_M: Final = 1.0  # Lower and higher parts of a surface that are shorter (m) are not told apart.
 _END_M: Final = 0.25  # A surface ends with the last part of it so long (m) …
 _END_RETURNS: Final = 3  # … that holds so many returns.
@@ -104,20 +108,33 @@ class Panel:
 @once_a_scene
 def panels_of(scene: Scene) -> list[Panel]:
     """Returns panels of all upright surfaces of a scene with its halo."""
-    highest = _highest_elevation_deg(scene)
+    highest = highest_elevation_deg(scene)
     panels = [_panel(scene, region, highest) for region in regions_of(scene)]
     return _with_sight(scene, [p for p in panels if p is not None])
 
 
-def _highest_elevation_deg(scene: Scene) -> float:
-    """Returns the elevation that hardly any sight line exceeds (degrees)."""
-    returns = scene.returns
-    if len(returns) == 0:
-        return 90.0
-    some = slice(None, None, max(1, len(returns) // _MOST_LINES))
-    flat = np.hypot(returns.x_m[some] - returns.sensor_x_m[some], returns.y_m[some] - returns.sensor_y_m[some])
-    rise = returns.height_m[some] - returns.sensor_height_m[some]
-    return float(np.degrees(np.quantile(np.arctan2(rise, flat), 0.999)))
+def highest_elevation_deg(scene: Scene) -> float:
+    """Returns the elevation that hardly any sight line of the survey exceeds (degrees)."""
+
+    def from_nadir() -> Float64:
+        r, some = scene.returns, _sampled(scene)
+        flat = np.hypot(r.x_m[some] - r.sensor_x_m[some], r.y_m[some] - r.sensor_y_m[some])
+        angle = 90.0 + np.degrees(np.arctan2(r.height_m[some] - r.sensor_height_m[some], flat))
+        angle = angle[np.isfinite(angle)]
+        return angle[angle >= np.quantile(angle, _HIGHEST[0])] if angle.size else angle
+
+    found = scene.statistics.of("highest_beam_from_nadir_deg", _HIGHEST[1], from_nadir)
+    return 90.0 if found is None else found - 90.0
+
+
+def _sampled(scene: Scene) -> Bool:
+    """Returns a mask (n,) of the returns whose sight lines are compared with surfaces."""
+    returns, density = scene.returns, scene.statistics.of("returns_per_m2", 0.5, lambda: np.zeros(0))
+    one_of = max(round((density or 0.0) / _LINES_PER_M2), 1)
+    bits = returns.epoch_gps_ns.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    bits ^= np.rint(1e4 * returns.height_m).astype(np.int64).astype(np.uint64) * np.uint64(0xC2B2AE3D27D4EB4F)
+    bits = (bits ^ returns.laser) * np.uint64(0xBF58476D1CE4E5B9)
+    return np.asarray((bits >> np.uint64(32)) % np.uint64(one_of) == 0)
 
 
 def _panel(scene: Scene, region: Region, highest_deg: float) -> Panel | None:
@@ -273,10 +290,8 @@ def _medians(d: Float64, stretch: npt.NDArray[np.int32], count: int) -> Float64:
 def _with_sight(scene: Scene, panels: list[Panel]) -> list[Panel]:
     """Returns the panels with the numbers of sight lines that end on them, and that pass through."""
     returns = scene.returns
-    step = max(1, -(-len(returns) // _MOST_LINES))
-    some = slice(None, None, step)
-    taken = np.zeros(len(returns), np.bool_)
-    taken[some] = True
+    taken = _sampled(scene)
+    some = np.flatnonzero(taken)
     asked = [(p.high_m - p.ground_m <= _HIGH_M) & p.comes_near(scene.tile) for p in panels]
     lines = np.concatenate([np.zeros((0, 4)), *(
         np.column_stack([p.xy_m[:-1], p.xy_m[1:]])[low] for p, low in zip(panels, asked, strict=True)
@@ -287,7 +302,7 @@ def _with_sight(scene: Scene, panels: list[Panel]) -> list[Panel]:
     found = np.zeros((len(lines), _CELLS, _CELLS + 1), np.int64)
     passing_lines(
         returns.x_m[some], returns.y_m[some], returns.height_m[some], returns.sensor_x_m[some],
-        returns.sensor_y_m[some], returns.sensor_height_m[some], lines, bands, found,
+        returns.sensor_y_m[some], returns.sensor_height_m[some], lines, bands, SIGHT_M, found,
     )  # fmt: skip
     out, first = [], 0
     for p, low in zip(panels, asked, strict=True):

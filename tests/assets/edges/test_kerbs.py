@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from benchmarks.street_scores import SIDEWALK, TERRAIN, labelled_edges, points_along, share_within
 from roadscan.assets import classes
 from roadscan.assets.edges.find import edges_of_raster
+from roadscan.assets.edges.profiles import even_nodes
 from roadscan.assets.edges.steps import of_cells
 from roadscan.assets.kind import AssetObject
 from roadscan.assets.kinds.kerb import Kerb, KerbOptions
@@ -137,6 +138,16 @@ def test_lines_are_cut_at_tiles_and_joined_to_the_same(town: Scene) -> None:
     assert share_within(a, b, 0.04) >= 0.98
     assert share_within(b, a, 0.04) >= 0.98
     assert len(joined) <= len(whole) + 1
+
+
+def test_nodes_of_a_line_are_the_same_wherever_a_square_lets_it_begin() -> None:
+    at = np.linspace(0.0, 40.0, 400)
+    line = np.column_stack([at - 7.3, 3.0 * np.sin(at / 7.0) + 1.0])
+    whole, part = even_nodes(line, 0.5), even_nodes(line[37:-51], 0.5)
+    away, _ = cKDTree(whole).query(part)
+    inside = (part[:, 0] > 0.5) & (part[:, 0] < 24.0)  # from the first crossing of the lattice of 6 m to the last
+    assert inside.sum() > 40 and away[inside].max() < 1e-4
+    np.testing.assert_allclose(np.hypot(*np.diff(whole, axis=0).T), 0.5, atol=0.05)
 
 
 def test_returns_on_the_face_are_marked(town: Scene) -> None:

@@ -293,3 +293,14 @@ def test_what_is_spilt_is_bounded_and_removed(
     answer = query(finished.store(), statement, unconfined=True, limits=limits)
     assert answer.column(0).to_pylist() == [10_000_000]
     assert not list(tmp_path.iterdir())
+
+
+def test_what_fails_after_the_first_rows_is_an_error_of_roadscan(finished: Simulated, tmp_path: Path) -> None:
+    """A file that is damaged, and time that is up, while rows come already."""
+    store = finished.copy_with_store_to(tmp_path / "survey").store()
+    last = Path(store.path(max(store.files("tiles/cells", ".parquet"))))
+    last.write_bytes(last.read_bytes()[:-200])
+    with pytest.raises(RoadscanError, match=r"roadscan verify"):
+        query(store, "SELECT * FROM cells")
+    with pytest.raises(RoadscanError, match=r"was stopped after 0\.3 s"):
+        query(store, "SELECT range AS n FROM range(1_000_000_000_000)", limits=Limits(time_s=0.3))

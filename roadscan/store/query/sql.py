@@ -29,6 +29,12 @@ _MISTAKES = (duckdb.CatalogException, duckdb.BinderException, duckdb.ParserExcep
 """Errors of the statement."""
 ALWAYS = ("rejects",)
 """Tables that exist before they have a row: an empty table of rejects is an answer, too."""
+_LATE: Final = {
+    "INTERRUPT Error": duckdb.InterruptException,
+    "Out of Memory Error": duckdb.OutOfMemoryException,
+    "Permission Error": duckdb.PermissionException,
+}
+"""DuckDB's errors by the beginning of their messages, for those that come while an answer is fetched."""
 _MISSING = re.compile(r"Table (?:Function )?with name \"?(?P<name>\w+)\"? does not exist")
 """DuckDB's message for a missing table or table macro."""
 _CONFINED = (
@@ -315,7 +321,7 @@ def _answer(connection: duckdb.DuckDBPyConnection, statement: str) -> pa.Table:
         return pa.table({})
     reader = relation.to_arrow_reader(_BATCH_ROWS)
     parts, held = [], 0
-    for part in reader:
+    for part in _batches(reader):
         parts.append(part)
         held += part.nbytes
         if held > most:
@@ -324,6 +330,15 @@ def _answer(connection: duckdb.DuckDBPyConnection, statement: str) -> pa.Table:
                 change="ask for less at once (a LIMIT, a span of time), or give it more with --memory",
             )
     return pa.Table.from_batches(parts, reader.schema)
+
+
+def _batches(reader: pa.RecordBatchReader) -> Iterator[pa.RecordBatch]:
+    """Yield the batches of an answer; what fails after the first one, Arrow passes on as OSError, is DuckDB's error."""
+    try:
+        yield from reader
+    except OSError as error:
+        kind = next((kind for name, kind in _LATE.items() if name in str(error)), duckdb.Error)
+        raise kind(str(error)) from error
 
 
 @contextlib.contextmanager

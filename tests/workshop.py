@@ -174,7 +174,9 @@ class CellsInMemory:
 
     def values(self, tile: TileId, name: str) -> CellValues | None:
         cells = self(tile)
-        return None if cells is None else CellValues.of(cells, name)
+        return (
+            None if cells is None else CellValues(cells.cells_per_edge, cells.column, cells.row, getattr(cells, name))
+        )
 
 
 @dataclass

@@ -87,11 +87,6 @@ class CellValues(NamedTuple):
     """Row counted from the south edge."""
     values: npt.NDArray[Any]
 
-    @classmethod
-    def of(cls, cells: TileCells, name: str) -> CellValues:
-        """Return a column, by its name, of cells in memory."""
-        return cls(cells.cells_per_edge, cells.column, cells.row, getattr(cells, name))
-
 
 @dataclass(frozen=True)
 class TileEvidence:

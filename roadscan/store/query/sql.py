@@ -6,7 +6,7 @@ import contextlib
 import re
 import tempfile
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final, Protocol, TypeAlias
 
@@ -187,11 +187,13 @@ def tables_of(store: Store, logs: ShownLogs, damaged: list[StoreError] | None) -
     return Tables(of_logs, _made_files(store), manifest.table(), recorded_files(store, records, manifest))
 
 
-def _made_files(store: Store) -> dict[str, list[str]]:
-    """Return the URLs of the files of each table that a run made."""
-    made_of = {name: store.files(folder, ".parquet") for name, folder in table_locations().items()}
-    assets = store.files(ASSET_FOLDER, ".parquet")
-    made_of |= {name: [path] for name in asset_tables() if (path := f"{ASSET_FOLDER}/{name}.parquet") in assets}
+def _made_files(store: Store, names: Collection[str] | None = None) -> dict[str, list[str]]:
+    """Return the URLs of the files of each table that a run made, or of those tables among `names` alone."""
+    places = {name: place for name, place in table_locations().items() if names is None or name in names}
+    made_of = {name: store.files(folder, ".parquet") for name, folder in places.items()}
+    kinds = [name for name in asset_tables() if names is None or name in names]
+    assets = store.files(ASSET_FOLDER, ".parquet") if kinds else []
+    made_of |= {name: [path] for name in kinds if (path := f"{ASSET_FOLDER}/{name}.parquet") in assets}
     return {name: [url(store, f) for f in found] for name, found in made_of.items() if found}
 
 
@@ -207,14 +209,11 @@ def _made_tables_of(store: Store, statement: str, damaged: list[StoreError] | No
             names = connection.get_table_names(statement)
     except duckdb.Error:  # a table macro, a fault of the statement: reported by the connection that has all views
         return None
-    if not names:
-        return None
-    made = _made_files(store)
-    if not names <= made.keys():
+    made = _made_files(store, names)
+    if not made or made.keys() != names:
         return None
     manifest = Manifest(store, damaged)
-    read = {name: made[name] for name in sorted(names)}
-    return Tables({}, read, manifest.table(), recorded_files(store, [], manifest))
+    return Tables({}, made, manifest.table(), recorded_files(store, [], manifest))
 
 
 def statements_of(of_logs: Mapping[str, list[str]]) -> dict[str, str]:

@@ -77,7 +77,7 @@ class Sighting:
     point: ControlPoint
     run: int
     sensor: str
-    """Of the pose that `epoch_gps_ns` names: the one that saw the place."""
+    """Of the pose that `epoch_gps_ns` names: the one that saw the place in the mean."""
     status: SightStatus
     why_not: str
     epoch_gps_ns: int
@@ -96,7 +96,7 @@ class Sighting:
     contrast: float
     score: float
     arm_body_m: Float64
-    """(3,) from the body's origin to the place, body axes."""
+    """(3,) from the body's origin to the place, body axes: the mean of the readings that measured it."""
     level_from_body: Float64
     """(3, 3)"""
     convergence_rad: float
@@ -175,7 +175,12 @@ def sight(
         height = seen.height if np.isfinite(point.height_m) else HeightFind(nan, nan, nan, nan, seen.count, 0.0, "")
         at = np.array([point.easting_m, point.northing_m]) if seen.status != "found" else seen.place_m
         found = _with_pose(
-            point, heads, at, height, (seen.status, seen.why_not, seen.place_m, seen.covariance_m2, None)
+            point,
+            heads,
+            at,
+            height,
+            settings.height_radius_m,
+            (seen.status, seen.why_not, seen.place_m, seen.covariance_m2, None),
         )
         return replace(found, contrast=seen.contrast)
     if picked is not None:
@@ -196,7 +201,7 @@ def sight(
     if status == "doubled":
         nowhere = float("nan")
         height = replace(height, height_m=nowhere, sigma_m=nowhere, slope_east=nowhere, slope_north=nowhere)
-    return _with_pose(point, heads, at, height, (status, why_not, place, covariance, find))
+    return _with_pose(point, heads, at, height, settings.height_radius_m, (status, why_not, place, covariance, find))
 
 
 def sight_shifted(
@@ -225,6 +230,7 @@ def _with_pose(
     heads: Sequence[PassReadings],
     at: Float64,
     height: HeightFind,
+    radius_m: float,
     found: tuple[SightStatus, str, Float64, Float64, TargetFind | None],
 ) -> Sighting:
     status, why_not, place, covariance, find = found
@@ -232,11 +238,20 @@ def _with_pose(
     seen = [k for k, a in enumerate(away) if a.size]
     if not seen:
         return _unseen(point, heads[0])
-    head = heads[min(seen, key=lambda k: float(away[k].min()))]
-    reading = int(np.argmin(np.hypot(head.easting_m - at[0], head.northing_m - at[1])))
-    pose = int(head.pose[reading])
+    number = min(seen, key=lambda k: float(away[k].min()))
+    head, near = heads[number], away[number]
+    reading = int(np.argmin(near))
     level = height.height_m if np.isfinite(height.height_m) else float(head.height_m[reading])
-    arm = head.arm_body_m(np.array([[at[0], at[1], level]]), np.array([pose]))[0]
+    # A lidar sees a place from far before it to far behind it: what is measured moves with the mean of their arms.
+    first = sum(len(a) for a in away[:number])
+    weight = height.weight[first : first + near.size] if height.weight.size else (near <= radius_m).astype(np.float64)
+    used = np.flatnonzero(weight > 0.0)
+    used, weight = (used, weight[used]) if used.size else (np.array([reading]), np.ones(1))
+    poses = head.pose[used].astype(np.int64)
+    arms = head.arm_body_m(np.broadcast_to([at[0], at[1], level], (poses.size, 3)), poses)
+    arm = np.average(arms, axis=0, weights=weight)
+    since = head.epoch_gps_ns[poses] - head.epoch_gps_ns[poses[0]]
+    pose = int(poses[np.argmin(np.abs(since - np.average(since, weights=weight)))])
     return Sighting(
         point, head.run, head.sensor, status, why_not, int(head.epoch_gps_ns[pose]), float(place[0]), float(place[1]),
         covariance, height.height_m, height.sigma_m, height.slope_east, height.slope_north,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -248,6 +248,8 @@ class HeightFind:
     """Share of them that the surface uses."""
     why_not: str
     """"" where there is a height; else a sentence."""
+    weight: Float64 = field(default_factory=lambda: np.zeros(0))
+    """(n,) of each of the readings in the surface, 0 of those that it does not use; empty where there is no height."""
 
     @property
     def found(self) -> bool:
@@ -293,7 +295,9 @@ def height_at(readings: TargetReadings, easting_m: float, northing_m: float, set
     left = height - level - design @ plane
     sigma = float(np.hypot(np.sqrt(_variance(design, left, weight, place)), settings.sigma_plane_m))
     rise = plane[1:3] / settings.height_radius_m
-    return HeightFind(level + float(plane[0]), sigma, float(rise[0]), float(rise[1]), height.size, used, "")
+    shares = np.zeros(near.size)
+    shares[near] = weight
+    return HeightFind(level + float(plane[0]), sigma, float(rise[0]), float(rise[1]), height.size, used, "", shares)
 
 
 def _none(count: int, why_not: str) -> HeightFind:

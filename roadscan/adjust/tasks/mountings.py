@@ -68,6 +68,7 @@ _NAMES: Final = (
     "lever arm forward", "lever arm to the right", "lever arm down",
     "boresight roll", "boresight pitch", "boresight heading", "range scale",
 )  # fmt: skip
+_FIRST_TURN, _LAST_TURN = MOUNTED.index("roll_rad"), MOUNTED.index("heading_rad")
 DOUBTED: Final = 3.0
 """A mounting that is off by more than this many stated σ is reported."""
 CHANCE: Final = 0.0027
@@ -83,7 +84,8 @@ MOUNTING: Final = Witness(
     "mounting",
     input="rig file",
     fault="The mounting of a sensor, or the scale of its ranges, is not what the rig file or the calibration states.",
-    asks="passes side by side, heads of one pass and ground control, all in one adjustment",
+    asks="passes side by side, heads of one pass, planes that a lidar saw from before and from behind, and ground control, "
+    "all in one adjustment",
     does="mounting and scale are estimated with their stated σ as prior, and readings are placed with them; one that "
     "is off by more than three σ of what was stated is named",
     told=("findings",),
@@ -375,10 +377,15 @@ def mounting_findings(found: MountingErrors | None) -> list[Finding]:
         if off.size:
             words = [f"{_NAMES[c]} {_told(error[c], c, signed=True)} (σ {_told(found.sigma[k, c], c)}, "
                      f"stated σ {_told(prior[c], c)})" for c in off.tolist()]  # fmt: skip
+            like = (
+                " (attitudes of all poses that are turned by as much look the same)"
+                if ((off >= _FIRST_TURN) & (off <= _LAST_TURN)).any()
+                else ""
+            )
             said.append(
                 MOUNTING.finds(
                     _called(sensor),
-                    f"passes and control contradict the stated mounting: {', '.join(words)} have to be added to it; "
+                    f"passes and control contradict the stated mounting: {', '.join(words)} have to be added to it{like}; "
                     "readings are placed with the estimated mounting, correct the rig file or calibrate it anew",
                 )
             )
@@ -392,8 +399,9 @@ def mounting_lines(found: MountingErrors | None) -> list[str]:
         return lines
     for k, sensor in enumerate(found.sensors):
         prior, sigma = found.prior_sigma[k], found.sigma[k]
-        known = np.flatnonzero((prior > 0.0) & (sigma < DETERMINED * prior)).tolist()
-        unknown = np.flatnonzero((prior > 0.0) & (sigma >= DETERMINED * prior)).tolist()
+        determined = (sigma < DETERMINED * prior) | disproved(found)[k]
+        known = np.flatnonzero((prior > 0.0) & determined).tolist()
+        unknown = np.flatnonzero((prior > 0.0) & ~determined).tolist()
         words = [f"{_NAMES[c]} {_told(found.error[k, c], c, signed=True)} (σ {_told(sigma[c], c)})" for c in known]
         words += [f"{', '.join(_NAMES[c] for c in unknown)} not determined"] if unknown else []
         lines.append(f"mounting of {_called(sensor)}: {'; '.join(words)}")

@@ -29,6 +29,7 @@ from roadscan.adjust.observations import (
     MOUNTED,
     CameraPrior,
     GaussMarkov,
+    MountingPrior,
     Observations,
     RunPrior,
     StatedSigma,
@@ -74,6 +75,12 @@ from roadscan.poses.trajectory import Corrections
 
 _WIDENED: Final = 3
 """Adjustments, at most, until no mounting is off by more than its σ allows."""
+_TURNS: Final = {"roll_rad": 3, "pitch_rad": 4, "heading_rad": 5}
+"""Components of poses by the number of the turn of a mounting that looks like them."""
+_MUCH_TOO_SMALL: Final = 4.0
+"""Variance factor of attitudes from which on a turn of the sensors is asked instead: σ is half of what it should be."""
+_WIDE_RAD: Final = float(np.radians(5.0))
+"""1 σ of a turn that is free: an error of the hand, not of an adjustment."""
 _SOUND: Final = 0.1
 """Share of a run with GNSS, at least: a drive with less of it, or none, is all alike."""
 _IN_OUTAGE: Final = 3.0  # Factor of σ above that of the best part of a run from which on there is no GNSS.
@@ -330,7 +337,11 @@ def _adjusted(
             continue
         off = disproved(found.mountings) & ~filmed[:, None]
         if not off.any():
-            break
+            turned = _turned_for_good(joined, evidence.priors, settings, priors, cameras, found, filmed)
+            if turned is None:
+                break
+            priors = turned
+            continue
         sigma = np.where(off, np.abs(found.mountings.error), found.mountings.prior_sigma)
         priors = tuple(replace(one, sigma=own) for one, own in zip(priors, sigma, strict=True))
     stated = np.array([one.sigma for one in evidence.mounted.priors]).reshape(-1, len(MOUNTED))
@@ -349,6 +360,39 @@ def _adjusted(
             sigma=np.where(wrong[:, None], found.mountings.sigma, estimated.sigma),
         )
     return replace(found, mountings=replace(estimated, prior_sigma=stated)), first, named, approach
+
+
+def _turned_for_good(
+    observations: Observations,
+    poses: Sequence[RunPrior],
+    settings: AdjustmentSettings,
+    priors: Sequence[MountingPrior],
+    cameras: Sequence[CameraPrior],
+    found: Adjustment,
+    filmed: Bool,
+) -> tuple[MountingPrior, ...] | None:
+    """Returns priors of mountings that allow a sensor to be turned about each axis whose stated σ of the poses would be
+    much too small, where the poses are as stated once it is turned; None where they are not.
+
+    The same evidence has two explanations: a sensor that is turned for good, which is one unknown, or attitudes whose
+    σ are all too small. The first is asked first, as it is the simpler one. Variance components alone never find it:
+    they widen the process of the poses until this takes up the turn.
+    """
+    wide = [axis for name, axis in _TURNS.items() if found.variance_factors[name] > _MUCH_TOO_SMALL]
+    asked = np.isin(np.arange(len(MOUNTED)), wide)
+    free = tuple(
+        one if is_camera else replace(one, sigma=np.where(asked & (one.sigma > 0.0), _WIDE_RAD, one.sigma))
+        for one, is_camera in zip(priors, filmed.tolist(), strict=True)
+    )
+    if not any((one.sigma < other.sigma).any() for one, other in zip(priors, free, strict=True)):
+        return None
+    turned = adjust(observations, poses, settings, free, cameras)
+    if any(turned.variance_factors[name] > 1.0 for name, axis in _TURNS.items() if axis in wide):
+        return None
+    return tuple(
+        replace(one, sigma=np.where(one.sigma < other.sigma, np.maximum(np.abs(error), one.sigma), one.sigma))
+        for one, other, error in zip(priors, free, turned.mountings.error, strict=True)
+    )
 
 
 def _settings(config: AdjustConfig, mode: Literal["joint", "each_pass", "vertical"]) -> AdjustmentSettings:

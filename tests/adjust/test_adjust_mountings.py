@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from roadscan.adjust.tasks.outcome import known_findings
 from roadscan.simulate import Scene, simulate
 from roadscan.store.manifest import Manifest
 from roadscan.store.small_tables import read_small, small_path
-from tests.adjust.adjusted_site import cell_errors
+from tests.adjust.adjusted_site import adjust, cell_errors
 from tests.surveys import Simulated
 
 pytestmark = pytest.mark.nightly
@@ -100,3 +101,31 @@ def test_sigmas_of_zero_leave_mountings_as_they_are_stated(survey: Simulated) ->
     assert not store.exists(small_path("mounting_corrections"))
     stated, estimated = (np.sqrt(np.mean(cell_errors(survey, one) ** 2)) for one in (store, survey.store()))
     assert estimated < stated
+
+
+TURNED_DEG = 0.4
+"""Pitch of the lidar in the rig file minus the true one: 40 times the σ that is stated of it, and of the poses'."""
+
+
+@pytest.mark.witness("mounting")
+def test_one_drive_tells_the_pitch_of_its_lidar_and_no_control_is_blamed(tmp_path: Path) -> None:
+    """A lidar sees the same planes from before and from behind; variance components alone would widen the poses."""
+    scene = Scene.load("urban_street").changed(
+        length_m=50.0, passes=[{"lane": 2, "stops": []}], vehicle={"speed_m_per_s": 10.0, "standstill_s": 0.0},
+        profilers=OFF, camera=OFF, sick=OFF, imu=OFF, gnss=OFF, encoder=OFF,
+        lidar={"range_max_m": 30.0, "mount": {"error": {"pitch_deg": TURNED_DEG}}},
+        noise={
+            "position_m": 0.02, "down_m": 0.03, "attitude_deg": 0.01, "heading_deg": 0.03, "time_constant_s": 30.0,
+        },
+    )  # fmt: skip
+    one = Simulated(simulate(scene, tmp_path / "survey").survey_file)
+    adjust(one, stages=("ingest", "navigate", "footprints", "adjust"))
+    table = read_small(one.store(), "mounting_corrections")
+    assert table is not None
+    [row] = table.to_pylist()
+    pitch, sigma = np.degrees(row["pitch_rad"]), np.degrees(row["sigma_pitch_rad"])
+    assert abs(pitch + TURNED_DEG) < 3.0 * sigma < 0.06
+    findings = known_findings(Manifest(one.store()))
+    [said] = [found for found in findings if found.witness == "mounting"]
+    assert f"boresight pitch {pitch:+.4f}°" in said.text and "attitudes of all poses" in said.text
+    assert not [found for found in findings if found.witness in ("control_point", "stated_sigma")]

@@ -113,6 +113,25 @@ def test_a_turn_moves_what_it_says() -> None:
     assert moved_m(one, held) == pytest.approx(expected, abs=3e-6)
 
 
+def test_a_lidar_that_saw_a_point_from_before_and_from_behind_moves_it_by_the_mean_of_its_arms() -> None:
+    """A pitch lifts what is ahead and lowers what is behind: of readings of both, 3 : 1, half of the arm is left."""
+    here = readings(0.0, heading_rad=0.0, convergence_rad=0.0)
+    n = here.easting_m.size
+    pose = (np.arange(n) % 4 == 0).astype(np.int32)  # three of four from 10 m before it, one from 10 m behind
+    body = np.array([[1000.0, 1990.0, 52.0], [1000.0, 2010.0, 52.0]])
+    turned = np.broadcast_to(np.asarray(rotation_from_rph(0.0, 0.0, 0.0)).reshape(1, 3, 3), (2, 3, 3))
+    moving = replace(
+        here, pose=pose, epoch_gps_ns=np.array([5, 7]) * 10**9, body_m=body, level_from_body=turned,
+        height_m=np.full(n, 50.0),
+    )  # fmt: skip
+    one = sight(POINT, [moving], TARGETS, 0.02)
+    share = float((pose == 0).mean())
+    assert one.arm_body_m == pytest.approx([10.0 * (2.0 * share - 1.0), 0.0, 2.0], abs=0.1)
+    pitch = np.array([0.0, 0.001, 0.0])
+    held = Corrections(np.array([0, 10**10]), np.zeros((2, 3)), np.tile(pitch, (2, 1)))
+    assert moved_m(one, held)[2] == pytest.approx(0.001 * 10.0 * (2.0 * share - 1.0), abs=1e-4)
+
+
 def rotation_of(vector: np.ndarray) -> np.ndarray:
     from scipy.spatial.transform import Rotation
 

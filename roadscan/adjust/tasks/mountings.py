@@ -84,8 +84,8 @@ MOUNTING: Final = Witness(
     "mounting",
     input="rig file",
     fault="The mounting of a sensor, or the scale of its ranges, is not what the rig file or the calibration states.",
-    asks="passes side by side, heads of one pass, planes that a lidar saw from before and from behind, and ground control, "
-    "all in one adjustment",
+    asks="passes side by side, heads of one pass, planes that a lidar saw from before and from behind, and ground "
+    "control, all in one adjustment",
     does="mounting and scale are estimated with their stated σ as prior, and readings are placed with them; one that "
     "is off by more than three σ of what was stated is named",
     told=("findings",),
@@ -385,8 +385,9 @@ def mounting_findings(found: MountingErrors | None) -> list[Finding]:
             said.append(
                 MOUNTING.finds(
                     _called(sensor),
-                    f"passes and control contradict the stated mounting: {', '.join(words)} have to be added to it{like}; "
-                    "readings are placed with the estimated mounting, correct the rig file or calibrate it anew",
+                    f"passes and control contradict the stated mounting: {', '.join(words)} have to be added to it"
+                    f"{like}; readings are placed with the estimated mounting, correct the rig file or calibrate it "
+                    "anew",
                 )
             )
     return said

@@ -337,7 +337,7 @@ def _adjusted(
             continue
         off = disproved(found.mountings) & ~filmed[:, None]
         if not off.any():
-            turned = _turned_for_good(joined, evidence.priors, settings, priors, cameras, found, filmed)
+            turned = turned_for_good(joined, evidence.priors, settings, priors, cameras, found, filmed)
             if turned is None:
                 break
             priors = turned
@@ -362,7 +362,7 @@ def _adjusted(
     return replace(found, mountings=replace(estimated, prior_sigma=stated)), first, named, approach
 
 
-def _turned_for_good(
+def turned_for_good(
     observations: Observations,
     poses: Sequence[RunPrior],
     settings: AdjustmentSettings,

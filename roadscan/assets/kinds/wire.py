@@ -19,7 +19,7 @@ from roadscan.assets.kernels.cubes import lines_through
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
 from roadscan.assets.quantiles import median
 from roadscan.assets.scene import Box, Scene, once_a_scene
-from roadscan.assets.upright.pieces import seen_by
+from roadscan.assets.upright.pieces import seen_by_each
 from roadscan.compute.array_types import Bool, Float64, Int64
 
 CUBE_M: Final = 0.25
@@ -93,7 +93,8 @@ def thin_cubes(scene: Scene) -> tuple[pa.Table, list[Int64]]:
     cubes = chosen[kept]
     bounds, order = in_bins(own.astype(np.int32), len(places))
     held = [rows[order[bounds[k] : bounds[k + 1]]] for k in cubes.tolist()]
-    seen = [seen_by(scene, one) for one in held]
+    of_all, starts = np.concatenate([rows[:0], *held]), np.cumsum([0, *map(len, held)])
+    leaves = np.add.reduceat(np.isin(scene.classes[of_all], _VEGETATION), starts[:-1], dtype=np.int64)
     ground = scene.ground.height_at(middle[cubes, 0], middle[cubes, 1])
     table = pa.table(
         {
@@ -101,8 +102,7 @@ def thin_cubes(scene: Scene) -> tuple[pa.Table, list[Int64]]:
             "height_m": middle[cubes, 2], "clearance_m": middle[cubes, 2] - ground,
             "way_east": line[kept, 0], "way_north": line[kept, 1], "way_up": line[kept, 2], "filled": filled[kept],
             "beside": beside[kept], "crowd": crowd[cubes], "below": below[kept], "above": above[kept],
-            "leafy": [float(np.isin(scene.classes[one], _VEGETATION).mean()) for one in held],
-            **{name: [one[name] for one in seen] for name in PIECE_SCHEMA.names[-4:]},
+            "leafy": leaves / np.diff(starts), **seen_by_each(scene, of_all, starts),
         },
         schema=PIECE_SCHEMA,
     )  # fmt: skip

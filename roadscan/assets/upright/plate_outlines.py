@@ -461,6 +461,12 @@ def _to_wall(scene: Scene, plane: PlaneOfPlate) -> float:
     for region in regions_of(scene):
         if region.length_m > _LONG_M:
             away = region.distance_m(float(plane.middle[0]), float(plane.middle[1]), 0.3)
-            if away < least and np.isin(plane.rows, region.rows).mean() < 0.5:
+            if away < least and _among(region.rows, plane.rows).mean() < 0.5:
                 least = away
     return least
+
+
+def _among(rows: Int64, asked: Int64) -> Bool:
+    """Returns a mask (n,) of those asked for that are among rows (k,), ascending: a plate asks of a large surface."""
+    at = np.minimum(np.searchsorted(rows, asked), rows.size - 1)
+    return np.asarray(rows[at] == asked)

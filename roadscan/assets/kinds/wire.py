@@ -248,7 +248,7 @@ def _beyond(place: Float64, way: Float64, tree: cKDTree, free: Bool, span: Span,
     ends = span.along_m[[0, -1]] + [-step_m / 2, step_m / 2]
     between = np.linspace(float(ends[0]), float(ends[1]), 2 + int(np.ptp(ends)))
     about = tree.query_ball_point(span.places_m(between), step_m + 0.5)
-    found = np.array(sorted(set().union(*about)), np.int64)  # of lists so short, NumPy's arrays take thrice as long
+    found = np.array(sorted(set().union(*about)), np.int64)  # NumPy would turn list after list into an array
     found = found[free[found] & (np.abs(way[found] @ span.way) >= _ALONG)]
     along, off = _seen_from(place[found], span)
     inside = (np.abs(off) <= _ACROSS_M).all(axis=1)

@@ -18,6 +18,7 @@ from roadscan.assets.kernels.paint_levels import (
     scan_lines,
     seen_on_ground,
 )
+from roadscan.assets.kernels.plates import nearest_sides
 from roadscan.assets.kernels.step_filter import convolve, sizes_of, take_excess, window_means
 from roadscan.compute.kernel_options import read_only
 
@@ -178,3 +179,16 @@ def test_what_stands_has_the_class_of_its_cube() -> None:
     out[8] = 64
     standing_classes(above, number, cubes, place, sensor, (0.3, 0.5, 2.0, 15.0), (1, 3, 4, 5, 6, 14, 18), out)
     assert out.tolist() == [3, 1, 4, 5, 6, 14, 18, 1, 64]
+
+
+def test_the_nearest_side_of_a_beam_is_that_of_numpy_bit_for_bit() -> None:
+    rng = np.random.default_rng(7)
+    along, reach, sides = rng.normal(size=(40, 5)), rng.uniform(0.0, 0.1, (40, 5)), rng.normal(size=5)
+    along[3], reach[3], sides[:] = 0.25, 0.0, 0.5  # all sides are equal: the first counts
+    nearest, away, grows = np.empty(40, np.int64), np.empty(40), np.empty(40)
+    nearest_sides(along, reach, -0.2, sides, nearest, away, grows)
+    past, rows = along + -0.2 * reach - sides, np.arange(40)
+    assert nearest[3] == 0
+    np.testing.assert_array_equal(nearest, past.argmax(axis=1))
+    np.testing.assert_array_equal(away, past.max(axis=1))
+    np.testing.assert_array_equal(grows, reach[rows, nearest])

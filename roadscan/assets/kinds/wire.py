@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -19,7 +20,7 @@ from roadscan.assets.kernels.cubes import lines_through
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
 from roadscan.assets.quantiles import median
 from roadscan.assets.scene import Box, Scene, once_a_scene
-from roadscan.assets.upright.pieces import seen_by
+from roadscan.assets.upright.pieces import seen_by_each
 from roadscan.compute.array_types import Bool, Float64, Int64
 
 CUBE_M: Final = 0.25
@@ -93,7 +94,8 @@ def thin_cubes(scene: Scene) -> tuple[pa.Table, list[Int64]]:
     cubes = chosen[kept]
     bounds, order = in_bins(own.astype(np.int32), len(places))
     held = [rows[order[bounds[k] : bounds[k + 1]]] for k in cubes.tolist()]
-    seen = [seen_by(scene, one) for one in held]
+    of_all, starts = np.concatenate([rows[:0], *held]), np.cumsum([0, *map(len, held)])
+    leaves = np.add.reduceat(np.isin(scene.classes[of_all], _VEGETATION), starts[:-1], dtype=np.int64)
     ground = scene.ground.height_at(middle[cubes, 0], middle[cubes, 1])
     table = pa.table(
         {
@@ -101,8 +103,7 @@ def thin_cubes(scene: Scene) -> tuple[pa.Table, list[Int64]]:
             "height_m": middle[cubes, 2], "clearance_m": middle[cubes, 2] - ground,
             "way_east": line[kept, 0], "way_north": line[kept, 1], "way_up": line[kept, 2], "filled": filled[kept],
             "beside": beside[kept], "crowd": crowd[cubes], "below": below[kept], "above": above[kept],
-            "leafy": [float(np.isin(scene.classes[one], _VEGETATION).mean()) for one in held],
-            **{name: [one[name] for one in seen] for name in PIECE_SCHEMA.names[-4:]},
+            "leafy": leaves / np.diff(starts), **seen_by_each(scene, of_all, starts),
         },
         schema=PIECE_SCHEMA,
     )  # fmt: skip
@@ -151,10 +152,15 @@ class Span:
     """(2,) its direction in plan."""
     along_m: Float64
     """(n,) of each cube, ascending."""
-    off_m: Float64
-    """(n, 2) of each cube, to the left of the span and above it."""
+    own_m: Float64
+    """(n, 3) easting, northing and height of each cube."""
     heights: Float64
     """Polynomial of the height over `along_m` (m), highest power first."""
+
+    @cached_property
+    def off_m(self) -> Float64:
+        """Returns how far (n, 2) each cube lies to the left of the span and above it; a span that grows asks no one."""
+        return np.zeros((1, 2)) if self.rows.size == 1 else _seen_from(self.own_m, self)[1]
 
     @property
     def length_m(self) -> float:
@@ -225,7 +231,9 @@ def _grown(place: Float64, way: Float64, tree: cKDTree, free: Bool, seed: int) -
 
 
 def _without_neighbours(place: Float64, span: Span) -> Span:
-    """Returns a span without the cubes that lie off it, by the median of deviations."""
+    """Returns a span without the cubes that lie off it, by the median of deviations; one of too few as it is."""
+    if span.rows.size < _LEAST_CUBES:
+        return span
     for _ in range(_ROUNDS):
         deviation = np.maximum(1.4826 * np.array([median(off) for off in np.abs(span.off_m).T]), _LEAST_OFF_M)
         inside = (np.abs(span.off_m) <= _OUTLIER * deviation).all(axis=1)
@@ -239,7 +247,8 @@ def _beyond(place: Float64, way: Float64, tree: cKDTree, free: Bool, span: Span,
     """Returns the cubes of a span and of its line up to a step beyond its ends."""
     ends = span.along_m[[0, -1]] + [-step_m / 2, step_m / 2]
     between = np.linspace(float(ends[0]), float(ends[1]), 2 + int(np.ptp(ends)))
-    found = np.unique(np.concatenate(tree.query_ball_point(span.places_m(between), step_m + 0.5)).astype(np.int64))
+    about = tree.query_ball_point(span.places_m(between), step_m + 0.5)
+    found = np.array(sorted(set().union(*about)), np.int64)  # NumPy would turn list after list into an array
     found = found[free[found] & (np.abs(way[found] @ span.way) >= _ALONG)]
     along, off = _seen_from(place[found], span)
     inside = (np.abs(off) <= _ACROSS_M).all(axis=1)
@@ -259,7 +268,7 @@ def _fitted(place: Float64, rows: Int64, way: Float64) -> Span:
     """Returns the span of some cubes by least squares; a short one keeps the direction `way`."""
     own = place[rows]
     if rows.size == 1:
-        return Span(rows, own[0, :2], way, np.zeros(1), np.zeros((1, 2)), own[:, 2])
+        return Span(rows, own[0, :2], way, np.zeros(1), own, own[:, 2])
     middle = own[:, :2].mean(axis=0)
     past = own[:, :2] - middle
     if np.ptp(past @ way) > 1.0:
@@ -270,8 +279,7 @@ def _fitted(place: Float64, rows: Int64, way: Float64) -> Span:
     degree = 2 if length >= _BENT_M else int(length > 0.5)
     heights = np.polyfit(along, own[:, 2], degree)
     order = np.argsort(along, kind="stable")
-    span = Span(rows[order], middle, way, along[order], np.zeros((rows.size, 2)), heights)
-    return Span(span.rows, middle, way, along[order], _seen_from(own[order], span)[1], heights)
+    return Span(rows[order], middle, way, along[order], own[order], heights)
 
 
 def features_of(span: Span, pieces: pa.Table) -> dict[str, float]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 import pyarrow as pa
 import shapely
 
@@ -60,6 +61,21 @@ def seen_by(scene: Scene, rows: Int64) -> dict[str, Any]:
         "passes": passes_of(scene, rows),
         "first_epoch_gps_ns": int(epochs.min()),
         "last_epoch_gps_ns": int(epochs.max()),
+    }
+
+
+def seen_by_each(scene: Scene, rows: Int64, starts: Int64) -> dict[str, npt.ArrayLike | pa.Array]:
+    """Returns the same (k,) of groups of returns, of which none is empty: `rows` from `starts` (k + 1,) of each."""
+    epochs, number = scene.returns.epoch_gps_ns[rows], np.diff(starts)
+    passes = scene.returns.pass_id[rows].astype(np.int64)
+    many = int(passes.max(initial=0)) + 1
+    group, seen = np.divmod(np.unique(np.repeat(np.arange(number.size), number) * many + passes), many)
+    first = np.searchsorted(group, np.arange(number.size + 1))
+    return {
+        "returns": number,
+        "passes": pa.ListArray.from_arrays(pa.array(first, pa.int32()), pa.array(seen, pa.int32())),
+        "first_epoch_gps_ns": np.minimum.reduceat(epochs, starts[:-1]),
+        "last_epoch_gps_ns": np.maximum.reduceat(epochs, starts[:-1]),
     }
 
 

@@ -222,7 +222,8 @@ def _order_of(scene: Scene, rows: Int64) -> _Order | None:
     returns, ends = scene.returns, _ends_of_stamps(scene)
     epoch, laser = returns.epoch_gps_ns[rows], returns.laser[rows].astype(np.int64)
     device = returns.pass_id[rows].astype(np.int64) * 256 + returns.sensor[rows]
-    together = np.diff(ends, prepend=-1)[np.searchsorted(ends, rows)]
+    run = np.searchsorted(ends, rows)
+    together = ends[run] - np.where(run > 0, ends[run - 1], -1)
     timed = bool(np.median(together) <= _OF_A_FIRING * (1 + int(returns.laser.max())))
     begun, later = np.diff(device, prepend=-1) != 0, np.abs(np.diff(epoch, prepend=epoch[:1]))
     order = _Order(scene, int(rows[0]), begun | (later > 0), timed)

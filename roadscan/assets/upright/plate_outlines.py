@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Final, NamedTuple
@@ -11,6 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.special import expit, ndtri
 
 from roadscan.assets import classes
+from roadscan.assets.kernels.plates import nearest_sides
 from roadscan.assets.scene import Scene, once_a_scene
 from roadscan.assets.upright.brightness import brightness
 from roadscan.assets.upright.plate_beams import Beams
@@ -115,18 +117,42 @@ def outline_of(points: Float64, beams: Beams | None = None, spot: Spot = NO_SPOT
 
 def _hulls(points: Float64) -> list[tuple[float, str, Float64]]:
     """Returns misfit, name, and place and size of each template about points, the best first."""
-    angle = np.arange(_DIRECTIONS) * (2.0 * math.pi / _DIRECTIONS)
-    ways = np.column_stack([np.cos(angle), np.sin(angle)])
-    reach = np.sort(points @ ways.T, axis=0)[-1 - int(_TRIMMED * len(points))]
+    ways, outermost = _all_around(), len(points) - 1 - int(_TRIMMED * len(points))
+    reach = np.partition(points @ ways.T, outermost, axis=0)[outermost]
     found = []
-    for shape, templates in _TEMPLATES.items():
-        columns = np.column_stack([ways, *[t(ways) for t in templates]])
+    for shape in _TEMPLATES:
+        columns = _hull_columns(shape)
         solution, *_ = np.linalg.lstsq(columns, reach, rcond=None)
         misfit = float(np.sqrt(np.mean((columns @ solution - reach) ** 2)))
         if (solution[2:] > _LEAST_M).all():
             solution[2:] += 2.0 * _BEYOND * math.sqrt(solution[2] * solution[-1] / len(points))
             found.append((misfit, shape, solution))
     return sorted(found, key=lambda f: f[0])
+
+
+@functools.cache
+def _all_around() -> Float64:
+    """Returns the directions (36, 2) in which the extent of the returns is measured."""
+    angle = np.arange(_DIRECTIONS) * (2.0 * math.pi / _DIRECTIONS)
+    return np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+@functools.cache
+def _hull_columns(shape: str) -> Float64:
+    """Returns how far the hull of a template moves with place and size (36, n) in each of these directions."""
+    return _columns_of(shape, _all_around())
+
+
+@functools.cache
+def _sides_of(shape: str) -> tuple[Float64, Float64]:
+    """Returns the directions (k, 2) of the sides of a template, and how far they move with place and size (k, n)."""
+    angle = np.deg2rad(_SIDES[shape])
+    ways = np.column_stack([np.cos(angle), np.sin(angle)])
+    return ways, _columns_of(shape, ways)
+
+
+def _columns_of(shape: str, ways: Float64) -> Float64:
+    return np.column_stack([ways, *[t(ways) for t in _TEMPLATES[shape]]])
 
 
 def _parting(shape: str, first: Float64, beams: Beams, doubt_m: float) -> tuple[float, Float64, float]:
@@ -137,9 +163,7 @@ def _parting(shape: str, first: Float64, beams: Beams, doubt_m: float) -> tuple[
     """
     from scipy.optimize import minimize
 
-    angle = np.deg2rad(_SIDES[shape])
-    ways = np.column_stack([np.cos(angle), np.sin(angle)])
-    columns = np.column_stack([ways, *[t(ways) for t in _TEMPLATES[shape]]])
+    ways, columns = _sides_of(shape)
     needed = _needed(columns @ first, ways, beams)
     reach_hit, reach_by = beams.hit_spot.reach(ways), beams.passed_spot.reach(ways)
     within = beams.hits @ ways.T - needed * reach_hit
@@ -154,19 +178,20 @@ def _parting(shape: str, first: Float64, beams: Beams, doubt_m: float) -> tuple[
     beyond = np.concatenate([beyond, expected])
     reach_by = np.concatenate([reach_by, np.broadcast_to(slanted * spot, expected.shape)])
     begin = np.append(first, 0.0)
+    sides = [(side, along, reach, np.empty(len(along), np.int64), np.empty(len(along)), np.empty(len(along)))
+             for side, along, reach in ((1.0, within, reach_hit), (-1.0, beyond, reach_by))]  # fmt: skip
 
     def loss(solution: Float64, blur: float) -> tuple[float, Float64]:
         slope = np.append(_HOLD * (solution[:-1] - first), _HOLD_LESS_M * solution[-1] / _LESS_SIGMA**2)
         value = 0.5 * float(((solution - begin) * slope).sum())
-        for side, along, reach in ((1.0, within, reach_hit), (-1.0, beyond, reach_by)):
-            past = along + solution[-1] * reach - columns @ solution[:-1]
-            nearest = past.argmax(axis=1)
-            rows = np.arange(len(past))
-            past = side * past[rows, nearest] / blur
+        at = columns @ solution[:-1]
+        for side, along, reach, nearest, away, grows in sides:
+            nearest_sides(along, reach, solution[-1], at, nearest, away, grows)
+            past = side * away / blur
             value += blur * float(np.logaddexp(0.0, past).sum())
             push = side * expit(past)
             slope[:-1] -= push @ columns[nearest]
-            slope[-1] += float(push @ reach[rows, nearest])
+            slope[-1] += float(push @ grows)
         return value, slope
 
     solution, value = begin, 0.0
@@ -213,12 +238,16 @@ def _rooms(within: Float64, beyond: Float64, half_gap: Float64) -> Float64:
     within, beyond : (n, k) how far beams that hit and that passed lie past each side. half_gap : (k,).
     """
     room = 2.0 * half_gap
-    for k in range(room.size):
-        level = (np.delete(beyond, k, axis=1) < 0.0).all(axis=1)
-        outside = beyond[level & (beyond[:, k] > -room[k]), k]
-        if outside.size:
-            room[k] = min(room[k], abs(float(outside.min()) - float(within[:, k].max())))
+    outside = np.where(_past_one(beyond) & (beyond > -room), beyond, np.inf).min(axis=0, initial=np.inf)
+    known = np.isfinite(outside)
+    room[known] = np.minimum(room, np.abs(outside - within.max(axis=0, initial=-np.inf)))[known]
     return room
+
+
+def _past_one(beyond: Float64) -> Bool:
+    """Returns where (n, k) a beam lies within all sides but that one, past which it lies or not."""
+    past = ~(beyond < 0.0)
+    return np.asarray(past.sum(axis=1)[:, None] == past)
 
 
 def _sigma_of_size(shape: str, columns: Float64, room: Float64, doubt_m: float) -> float:
@@ -245,10 +274,9 @@ def _to_sides(within: Float64, beyond: Float64, half_gap: Float64) -> Float64:
     within, beyond : (n, sides) how far beams that hit and that passed lie past each side.
     half_gap : (sides,) half the widest gap between lines (m).
     """
-    out = np.zeros(half_gap.size)
+    out, level = np.zeros(half_gap.size), _past_one(beyond)
     for k in range(out.size):
-        level = (np.delete(beyond, k, axis=1) < 0.0).all(axis=1)
-        last, following = within[within[:, k] <= 0.0, k], beyond[level & (beyond[:, k] >= 0.0), k]
+        last, following = within[within[:, k] <= 0.0, k], beyond[level[:, k] & (beyond[:, k] >= 0.0), k]
         if last.size and following.size:
             out[k] = last.max() + min((following.min() - last.max()) / 2, half_gap[k])
     return out
@@ -433,6 +461,12 @@ def _to_wall(scene: Scene, plane: PlaneOfPlate) -> float:
     for region in regions_of(scene):
         if region.length_m > _LONG_M:
             away = region.distance_m(float(plane.middle[0]), float(plane.middle[1]), 0.3)
-            if away < least and np.isin(plane.rows, region.rows).mean() < 0.5:
+            if away < least and _among(region.rows, plane.rows).mean() < 0.5:
                 least = away
     return least
+
+
+def _among(rows: Int64, asked: Int64) -> Bool:
+    """Returns a mask (n,) of those asked for that are among rows (k,), ascending: a plate asks of a large surface."""
+    at = np.minimum(np.searchsorted(rows, asked), rows.size - 1)
+    return np.asarray(rows[at] == asked)

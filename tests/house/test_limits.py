@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.house import __main__ as command
-from tests.house import limits
+from tests.house import figures, limits
 from tests.house.limits import Limit
 
 FOUND = {"lines": 120, "files": 7}
@@ -97,6 +97,25 @@ def test_a_new_name_needs_a_reason() -> None:
     (told,) = limits.unexplained({**before, "lines of levels": Limit(90)}, before)
     assert told == "lines of levels: its limit is new and has no reason beside it"
     assert len(limits.unexplained({"lines of levels": Limit(90), "lines": Limit(101)}, before)) == 2
+
+
+@pytest.mark.parametrize("name", figures.WAYS)
+def test_a_way_begins_at_a_format(name: str) -> None:
+    """Each way is measured from the log."""
+    assert figures.WAYS[name][0].startswith("roadscan.formats.")
+
+
+def test_files_with_words_of_llvm_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Names that are handed on count as those that are imported from LLVM itself; names of the compiler do not."""
+    texts = {
+        "a.py": "from roadscan.compute.numba_internals import ir, types\n",
+        "b.py": "from roadscan.compute.numba_internals import (\n    KNOWN,\n    cgutils,\n)\n",
+        "c.py": "from roadscan.compute.numba_internals import (\n    KNOWN,\n)\nfrom x import (\n    ir,\n)\n",
+        "d.py": "from numba.core import types\n",
+    }
+    monkeypatch.setattr(figures, "sources", lambda: {Path(name): text for name, text in texts.items()})
+    found = {"files with private names of Numba": 1, "kernel files with LLVM words": 2}
+    assert figures.private_names() == found
 
 
 def test_the_limits_of_the_repository_hold() -> None:

@@ -96,6 +96,56 @@ def test_links_lead_somewhere(page: Path) -> None:
             assert anchor in anchors(there), target
 
 
+SOURCES = [
+    file.relative_to(ROOT)
+    for folder in ("roadscan", "tests", "docs", "examples", "benchmarks", "flows", "schemas", "fuzzed", "deploy")
+    for file in (ROOT / folder, *(ROOT / folder).rglob("*"))
+]
+FEATURES = {file.parts[1] for file in SOURCES if file.parts[0] == "roadscan" and len(file.parts) > 2}
+PLACEHOLDER = re.compile(r"\b[A-Z]+\b")
+"""A word that stands for a name, as NAME in `roadscan/formats/NAME.py`."""
+
+
+def missing(text: str, *, by_feature: bool) -> set[str]:
+    """Return what a page names in backticks that is no file or folder: names of Python files, and paths of folders.
+
+    With `by_feature` a file named without its folder has to lie in a feature that its section names, or in no feature.
+    A path such as `demo/street/`, below a folder that the demo writes, is no folder of the library.
+    """
+    found = set()
+    for section in re.split(r"^(?=## )", re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE), flags=re.M):
+        named = set(re.findall(r"\w+", section)) & FEATURES
+        for name in re.findall(r"`([\w./-]+)`", section):
+            parts = tuple(PLACEHOLDER.sub("*", part) for part in Path(name).parts)
+            is_folder = name.endswith("/") and parts[0] in {"roadscan", "tests"} | FEATURES - {"demo"}
+            if not (name.endswith(".py") or is_folder or name.startswith(("roadscan/", "tests/"))):
+                continue
+            if not any(
+                file.match("/".join(parts))
+                and (len(parts) > 1 or not by_feature or file.parts[0] != "roadscan" or {*file.parts[1:2]} <= named)
+                for file in SOURCES
+            ):
+                found.add(name)
+    return found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_files_that_a_page_names_exist(page: Path) -> None:
+    """The changelog tells of the past and is left out."""
+    if page.name != "CHANGELOG.md":
+        assert missing(page.read_text(), by_feature=page.name == "architecture.md") == set()
+
+
+def test_a_file_that_is_gone_is_noticed() -> None:
+    text = (
+        "## Of tiles\n`tiles/cells.py`, `tiles/cellz.py`, `tiles/nowhere/`, `tests/core`, `tests/kore`, `superseded/`"
+    )
+    gone = {"tiles/cellz.py", "tiles/nowhere/", "tests/kore"}
+    assert missing(text, by_feature=False) == gone
+    assert missing(text + ", `caster.py`", by_feature=False) == gone
+    assert missing(text + ", `caster.py`", by_feature=True) == {*gone, "caster.py"}  # it lies in simulate
+
+
 def test_every_page_is_linked_from_the_index() -> None:
     index = ROOT / "docs" / "index.md"
     linked = {(index.parent / target.partition("#")[0]).resolve() for target in links(index)}

@@ -268,7 +268,8 @@ def test_a_survey_from_arrays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 CONTRIBUTING = ROOT / "CONTRIBUTING.md"
 BASES = (
-    "LogFormat", "TileProduct", "SurveyProduct", "ConditionIndex", "AssetKind", "Stage", "SurveySection", "Section", "LayerKind"
+    "LogFormat", "TileProduct", "SurveyProduct", "ConditionIndex", "AssetKind", "Stage", "SurveySection",
+    "Section", "LayerKind"
 )  # fmt: skip
 GROUPS = {
     "formats": "roadscan.formats", "levels": "roadscan.stages", "assets/kinds": "roadscan.asset_kinds",

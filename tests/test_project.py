@@ -57,7 +57,7 @@ REQUIRED = {
 }  # fmt: skip
 """What every installation has. Whatever only some surveys need belongs to an extra (`roadscan/core/extras.py`)."""
 MOST_DISTRIBUTIONS = 140
-"""Beside roadscan in an installation without extras: all that it requires, directly or not; Prefect and Dask alone are 119."""
+"""Beside roadscan in an installation without extras, required directly or not; Prefect and Dask alone are 119."""
 
 
 def test_required_packages_are_these() -> None:

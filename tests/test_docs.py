@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import datetime as dt
+import functools
 import re
 import runpy
 import shlex
+import shutil
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import laspy
@@ -23,6 +28,8 @@ from docs import generate
 from roadscan.assets.kind import asset_kinds, table_of_objects
 from roadscan.assets.scene import Box, GroundModel, Returns, Scene
 from roadscan.cli import app
+from roadscan.condition.index import condition_indices
+from roadscan.condition.lane_data import LaneData, Profile
 from roadscan.core.crs import MapFrame
 from roadscan.core.errors import StoreError
 from roadscan.core.gpstime import Clock, TimeSystem, gps_ns_from_utc
@@ -40,6 +47,7 @@ from roadscan.store.schema import _schema_files, table_schema
 from roadscan.survey.status import survey_status, verify_store
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.product import ProductContext, SurveyProduct, Tile, TileProduct, product_named, products
+from tests.house import figures
 from tests.surveys import Simulated
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -94,6 +102,56 @@ def test_links_lead_somewhere(page: Path) -> None:
         assert there.exists(), target
         if anchor:
             assert anchor in anchors(there), target
+
+
+SOURCES = [
+    file.relative_to(ROOT)
+    for folder in ("roadscan", "tests", "docs", "examples", "benchmarks", "flows", "schemas", "fuzzed", "deploy")
+    for file in (ROOT / folder, *(ROOT / folder).rglob("*"))
+]
+FEATURES = {file.parts[1] for file in SOURCES if file.parts[0] == "roadscan" and len(file.parts) > 2}
+PLACEHOLDER = re.compile(r"\b[A-Z]+\b")
+"""A word that stands for a name, as NAME in `roadscan/formats/NAME.py`."""
+
+
+def missing(text: str, *, by_feature: bool) -> set[str]:
+    """Return what a page names in backticks that is no file or folder: names of Python files, and paths of folders.
+
+    With `by_feature` a file named without its folder has to lie in a feature that its section names, or in no feature.
+    A path such as `demo/street/`, below a folder that the demo writes, is no folder of the library.
+    """
+    found = set()
+    for section in re.split(r"^(?=## )", re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE), flags=re.M):
+        named = set(re.findall(r"\w+", section)) & FEATURES
+        for name in re.findall(r"`([\w./-]+)`", section):
+            parts = tuple(PLACEHOLDER.sub("*", part) for part in Path(name).parts)
+            is_folder = name.endswith("/") and parts[0] in {"roadscan", "tests"} | FEATURES - {"demo"}
+            if not (name.endswith(".py") or is_folder or name.startswith(("roadscan/", "tests/"))):
+                continue
+            if not any(
+                file.match("/".join(parts))
+                and (len(parts) > 1 or not by_feature or file.parts[0] != "roadscan" or {*file.parts[1:2]} <= named)
+                for file in SOURCES
+            ):
+                found.add(name)
+    return found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_files_that_a_page_names_exist(page: Path) -> None:
+    """The changelog tells of the past and is left out."""
+    if page.name != "CHANGELOG.md":
+        assert missing(page.read_text(), by_feature=page.name == "architecture.md") == set()
+
+
+def test_a_file_that_is_gone_is_noticed() -> None:
+    text = (
+        "## Of tiles\n`tiles/cells.py`, `tiles/cellz.py`, `tiles/nowhere/`, `tests/core`, `tests/kore`, `superseded/`"
+    )
+    gone = {"tiles/cellz.py", "tiles/nowhere/", "tests/kore"}
+    assert missing(text, by_feature=False) == gone
+    assert missing(text + ", `caster.py`", by_feature=False) == gone
+    assert missing(text + ", `caster.py`", by_feature=True) == {*gone, "caster.py"}  # it lies in simulate
 
 
 def test_every_page_is_linked_from_the_index() -> None:
@@ -210,13 +268,62 @@ def test_a_survey_from_arrays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 CONTRIBUTING = ROOT / "CONTRIBUTING.md"
 BASES = (
-    "LogFormat", "TileProduct", "SurveyProduct", "AssetKind", "Stage", "SurveySection", "Section", "LayerKind"
+    "LogFormat", "TileProduct", "SurveyProduct", "ConditionIndex", "AssetKind", "Stage", "SurveySection",
+    "Section", "LayerKind"
 )  # fmt: skip
 GROUPS = {
     "formats": "roadscan.formats", "levels": "roadscan.stages", "assets/kinds": "roadscan.asset_kinds",
+    "condition/indices": "roadscan.condition_indices",
     "tiles/products": "roadscan.products", "levels/settings": "roadscan.survey_sections",
     "report/sections": "roadscan.report_sections", "site/layers": "roadscan.site_layers",
 }  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def placed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the library with the examples of the page in the places that it names."""
+    folder = tmp_path_factory.mktemp("placed")
+    shutil.copytree(ROOT / "roadscan", folder / "roadscan", ignore=shutil.ignore_patterns("__pycache__"))
+    project, page = (ROOT / "pyproject.toml").read_text(), CONTRIBUTING.read_text()
+    ((before, line),) = re.findall(r'^```toml\n# pyproject.toml, before ("\w+")\n(.*?)\n```', page, re.MULTILINE)
+    assert project.count(f"  {before},\n") == 1
+    (folder / "pyproject.toml").write_text(project.replace(f"  {before},\n", f"  {line}\n  {before},\n"))
+    for name, text in re.findall(r"^```python\n# ([\w/]+\.py)\n(.*?)^```", page, re.MULTILINE | re.DOTALL):
+        file = folder / name
+        file.parent.mkdir(exist_ok=True)
+        file.write_text(text)
+    return folder
+
+
+def test_the_examples_pass_the_checks_in_their_places(placed: Path) -> None:
+    """Style, the order of imports, constants; a folder with code is a package, and one that the contracts know."""
+    run = functools.partial(subprocess.run, cwd=placed, capture_output=True, text=True, check=False)
+    programs = Path(sys.executable).parent
+    for words in (["check"], ["format", "--check"]):  # the flows are the link's, with rules of their own
+        outcome = run([str(programs / "ruff"), *words, "--no-cache", "--exclude", "roadscan/flows", "."])
+        assert outcome.returncode == 0, outcome.stdout + outcome.stderr
+    assert packages_without_init(placed / "roadscan") == []
+    command = [str(programs / "lint-imports"), "--no-logo", "--no-cache"]
+    outcome = run(command, env={"PYTHONPATH": str(placed), "PATH": ""})
+    assert outcome.returncode == 0, outcome.stdout + outcome.stderr
+    for name, text in re.findall(
+        r"^```python\n# ([\w/]+\.py)\n(.*?)^```", CONTRIBUTING.read_text(), re.MULTILINE | re.DOTALL
+    ):
+        assert all(figures._constants(text)), name
+
+
+def packages_without_init(library: Path) -> list[str]:
+    """Folders with code that lint-imports and the wheel would not see as packages."""
+    folders = {file.parent for file in library.rglob("*.py")}
+    return sorted(folder.as_posix() for folder in folders if not (folder / "__init__.py").exists())
+
+
+def test_every_folder_with_code_is_a_package(tmp_path: Path) -> None:
+    assert packages_without_init(ROOT / "roadscan") == []
+    (tmp_path / "levels").mkdir()
+    (tmp_path / "__init__.py").touch()
+    (tmp_path / "levels" / "stage.py").touch()
+    assert packages_without_init(tmp_path) == [(tmp_path / "levels").as_posix()]
 
 
 @pytest.fixture(scope="module")
@@ -226,6 +333,8 @@ def plugin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     blocks = re.findall(r"```python\n# roadscan/([\w/]+)/(\w+)\.py\n(.*?)```", CONTRIBUTING.read_text(), re.DOTALL)
     entries: dict[str, list[str]] = {}
     for group, file, code in blocks:
+        if file == "__init__":
+            continue
         module = f"{group}_{file}".replace("/", "_")
         text = code.replace("from roadscan.levels.settings", "from contributed_levels_settings")
         (folder / f"contributed_{module}.py").write_text(text)
@@ -262,6 +371,7 @@ def _look_again() -> None:
         stages,
         survey_file_model,
         sections,
+        condition_indices,
         layer_kinds,
         asset_kinds,
         asset_tables,
@@ -342,7 +452,23 @@ def test_the_contributed_product(plugin: Path, tmp_path: Path) -> None:
         product.check(file)
 
 
-def test_the_contributed_index(plugin: Path, tmp_path: Path) -> None:
+def test_the_contributed_index(plugin: Path) -> None:
+    """Of a sine wave, slopes over b have the amplitude 2 A sin(π b / L) / b, and half its square as variance."""
+    station = np.arange(0.0, 100.0, 0.05)
+    height = 0.01 * np.sin(2.0 * np.pi * station / 5.0)
+    path = Profile(station, np.column_stack([station, 0.0 * station]), height, np.full(station.size, 1e-4))
+    config = SimpleNamespace(profile_spacing_m=0.05, least_share=0.9)
+    lane = SimpleNamespace(
+        sections_m=((0.0, 50.0), (200.0, 300.0)), profiles={"left": path, "right": path}, config=config
+    )
+    lane.paths_share = lambda *ends: LaneData.paths_share(lane, *ends)  # type: ignore[arg-type]
+    known, beyond = condition_indices()["slope_variance"].values(lane)  # type: ignore[arg-type]
+    amplitude = 2.0 * 0.01 * np.sin(np.pi * 0.25 / 5.0) / 0.25
+    assert known.value == pytest.approx(1e6 * 0.5 * amplitude**2, rel=0.01)
+    assert np.isnan(beyond.value) and beyond.reason == "0 % of the wheel paths were measured"
+
+
+def test_the_contributed_product_over_tiles(plugin: Path, tmp_path: Path) -> None:
     product = product_named("flatness")
     assert isinstance(product, SurveyProduct)
     steps_m = {TileId(1, 1): 0.0, TileId(1, 2): 0.004, TileId(2, 1): None}

@@ -1,4 +1,8 @@
-"""The one module that knows names of Numba and LLVM outside Numba's documented interface; all others import them here.
+"""The one module that imports names of Numba and LLVM outside Numba's documented interface, and hands them on.
+
+Eight files of kernels write instructions of LLVM with the names that they import from here: ``ir`` and ``cgutils``, and
+``types`` of Numba. A Numba or LLVM that changes what these names mean breaks those files, and not this one alone
+(``python -m tests.house`` counts them). What Numba itself is changed to do stands here alone.
 
 Of a Numba whose internals were read (``KNOWN``), four things are changed, for this process:
 

@@ -58,8 +58,10 @@ def raised(found: Mapping[str, int], known: Mapping[str, Limit], pattern: str, w
     Raises
     ------
     SystemExit
-        if the reason has fewer than two words, or nothing that matches is exceeded.
+        if the reason has fewer than two words or names a merge, or nothing that matches is exceeded.
     """
+    if what_for.lower().startswith("merge"):
+        raise SystemExit(f"{what_for!r} is no reason: a merge brings lines, say what those lines are for")
     if len(what_for.split()) < 2:
         raise SystemExit(f"{what_for!r} is no reason: say in some words what the rise is for")
     risen = {
@@ -90,12 +92,19 @@ def unexplained(known: Mapping[str, Limit], before: Mapping[str, Limit]) -> list
             if name in before
             else f"{name}: its limit is new and has no reason beside it"
             for name, limit in known.items()
-            if (limit.most > before[name].most and limit.what_for in ("", before[name].what_for))
-            or (name not in before and not limit.what_for)
+            if _rose(limit, before.get(name)) and not _has_words_of_its_own(limit, before.get(name))
         ]
         if before
         else []
     )
+
+
+def _rose(limit: Limit, before: Limit | None) -> bool:
+    return before is None or limit.most > before.most
+
+
+def _has_words_of_its_own(limit: Limit, before: Limit | None) -> bool:
+    return limit.what_for not in ("", before.what_for if before else "")
 
 
 def earlier() -> dict[str, Limit]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.house import __main__ as command
-from tests.house import limits
+from tests.house import figures, limits
 from tests.house.limits import Limit
 
 FOUND = {"lines": 120, "files": 7}
@@ -60,9 +60,11 @@ def test_a_rise_has_a_reason(house: Path, monkeypatch: pytest.MonkeyPatch) -> No
     assert ends(monkeypatch) == 0
 
 
-@pytest.mark.parametrize("words", [("lines", "loops"), ("files", "a good reason")])
+@pytest.mark.parametrize(
+    "words", [("lines", "loops"), ("files", "a good reason"), ("lines", "merge: loops of the tie points")]
+)
 def test_what_is_no_rise_is_refused(house: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, str]) -> None:
-    """A single word is no reason, and what is not exceeded does not rise."""
+    """A single word is no reason, nor is a merge, and what is not exceeded does not rise."""
     before = house.read_text()
     with pytest.raises(SystemExit, match=r"is no reason|no figure"):
         ends(monkeypatch, "--raise", *words)
@@ -86,6 +88,34 @@ def test_an_old_reason_serves_no_new_rise(house: Path) -> None:
     first, second = {"lines": Limit(110, "the first feature")}, {"lines": Limit(120, "the first feature")}
     assert limits.unexplained(second, first)
     assert not limits.unexplained({"lines": Limit(120, "the second feature")}, first)
+
+
+def test_a_new_name_needs_a_reason() -> None:
+    """The limit of a new feature passes with words, is named without them, and hides no other's rise."""
+    before = {"lines": Limit(100)}
+    assert limits.unexplained({**before, "lines of levels": Limit(90, "the level of each tile")}, before) == []
+    (told,) = limits.unexplained({**before, "lines of levels": Limit(90)}, before)
+    assert told == "lines of levels: its limit is new and has no reason beside it"
+    assert len(limits.unexplained({"lines of levels": Limit(90), "lines": Limit(101)}, before)) == 2
+
+
+@pytest.mark.parametrize("name", figures.WAYS)
+def test_a_way_begins_at_a_format(name: str) -> None:
+    """Each way is measured from the log."""
+    assert figures.WAYS[name][0].startswith("roadscan.formats.")
+
+
+def test_files_with_words_of_llvm_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Names that are handed on count as those that are imported from LLVM itself; names of the compiler do not."""
+    texts = {
+        "a.py": "from roadscan.compute.numba_internals import ir, types\n",
+        "b.py": "from roadscan.compute.numba_internals import (\n    KNOWN,\n    cgutils,\n)\n",
+        "c.py": "from roadscan.compute.numba_internals import (\n    KNOWN,\n)\nfrom x import (\n    ir,\n)\n",
+        "d.py": "from numba.core import types\n",
+    }
+    monkeypatch.setattr(figures, "sources", lambda: {Path(name): text for name, text in texts.items()})
+    found = {"files with private names of Numba": 1, "kernel files with LLVM words": 2}
+    assert figures.private_names() == found
 
 
 def test_the_limits_of_the_repository_hold() -> None:

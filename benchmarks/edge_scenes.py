@@ -41,7 +41,8 @@ SEEN_OTHERWISE: Final = range(300, 308)
 """Seeds of the simulated streets."""
 _BESIDE_M: Final = 25.0  # Returns of a simulated street farther from its axis (m) are left out.
 _PART_M: Final = 15.0  # Edge of the parts of the recorded street (m).
-_LOWEST_M: Final = 0.015  # Lower kerbs of the simulator (m) are not judged.
+LOWEST_M: Final = 0.015
+"""Lower kerbs of the simulator (m) are not judged."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,10 +113,10 @@ def simulated(settings: Street) -> JudgedScene:
     scene = calibrated_scene(scene, gains_of([intensity_sample(scene)]))
     own = street.class_id[rows]
     return JudgedScene(settings.id, "simulated", scene, own == CLASSES.index("marking"), own != CLASSES.index("noise"),
-                       _simulated_kerbs(street.surface, settings, corner))  # fmt: skip
+                       simulated_kerbs(street.surface, settings, corner))  # fmt: skip
 
 
-def _simulated_kerbs(surface: Surface, settings: Street, corner_m: tuple[float, float]) -> Truth:
+def simulated_kerbs(surface: Surface, settings: Street, corner_m: tuple[float, float]) -> Truth:
     """Kerbs stand where the paved surface ends, as high as they are drawn; what is near to one is not judged."""
 
     def kerb(x_m: Float64, y_m: Float64) -> tuple[Bools, Float64]:
@@ -123,8 +124,8 @@ def _simulated_kerbs(surface: Surface, settings: Street, corner_m: tuple[float, 
         away, height = np.abs(np.abs(offset) - settings.road.paved_m), np.zeros(len(x_m))
         kerb_heights(surface.arrays, station, offset, height)
         near = away < 0.25
-        unknown = (near & (height < _LOWEST_M) & (height > 0.0)) | ((away >= 0.25) & (away < 0.45))
-        return near & (height >= _LOWEST_M), np.where(unknown, 0.0, 1.0)
+        unknown = (near & (height < LOWEST_M) & (height > 0.0)) | ((away >= 0.25) & (away < 0.45))
+        return near & (height >= LOWEST_M), np.where(unknown, 0.0, 1.0)
 
     return kerb
 

@@ -88,9 +88,9 @@ def judged_scenes(folder: Path) -> Iterator[JudgedScene]:
         yield simulated(drawn_street(seed), "plain", _PLAIN_WEIGHT)
 
 
-def simulated(street: Street, source: str, weight: float) -> JudgedScene:
-    """Return the scene of a simulated street."""
-    seen = labelled_returns(street)
+def simulated(street: Street, source: str, weight: float, seen: LabelledReturns | None = None) -> JudgedScene:
+    """Return the scene of a simulated street, of returns that were drawn before, or are drawn here."""
+    seen = seen or labelled_returns(street)
     returns, (inside, window, _, _) = seen.returns, in_window(seen, street)
     table = np.full(len(CLASSES), OTHER, np.uint8)
     for name, number in _OF_CLASS.items():

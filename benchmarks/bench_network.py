@@ -26,8 +26,7 @@ from benchmarks.scheduler import Watched, running_scheduler
 from benchmarks.settings import Settings
 from benchmarks.timing import Figure
 from roadscan.footprints.footprints import PRODUCT, FootprintTask, index_footprints
-from roadscan.run.engine.bundles import Bundle, Ended
-from roadscan.run.engine.compute import LazyTasks, rare_collections
+from roadscan.run.engine.compute import Bundle, Ended, LazyTasks, rare_collections
 from roadscan.run.engine.on_dask import OnDask
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.records import Packed, Row

@@ -18,8 +18,7 @@ from scipy.ndimage import gaussian_filter
 from benchmarks.timing import Figure, thread_seconds
 from roadscan.core.crs import MapFrame
 from roadscan.core.grid import TileGrid, TileId
-from roadscan.store.codecs.cog import Band
-from roadscan.store.codecs.tiff import raster_settings
+from roadscan.store.codecs.cog import Band, raster_settings
 from roadscan.tiles.cells import Level, TileCells
 from roadscan.tiles.product import ProductContext, Tile, TileSummary
 from roadscan.tiles.products.hillshade import HillshadeOptions, shade

@@ -20,7 +20,7 @@ from scipy.ndimage import gaussian_filter
 from benchmarks.timing import Figure, thread_seconds
 from roadscan.core.crs import MapFrame
 from roadscan.core.grid import TileGrid, TileId
-from roadscan.store.codecs.tiff import raster_crs, raster_settings
+from roadscan.store.codecs.cog import raster_crs, raster_settings
 from roadscan.tiles.cells import TileCells, overview_factors, pyramid_of, write_cells, write_overviews
 from roadscan.tiles.product import ProductContext, Tile
 from roadscan.tiles.products.geotiff import GeoTiff, GeoTiffOptions

@@ -29,8 +29,7 @@ from roadscan.footprints.footprints import PRODUCT, FootprintTask
 from roadscan.georeference.cloud import TilePoints
 from roadscan.georeference.tick_clocks import PRODUCT as TICKS
 from roadscan.georeference.tick_clocks import TickTask
-from roadscan.run.engine.bundles import Bundle, Ended
-from roadscan.run.engine.compute import Done, Inline
+from roadscan.run.engine.compute import Bundle, Done, Ended, Inline
 from roadscan.run.engine.measured import Measured
 from roadscan.run.keys import key_of
 from roadscan.run.session import Session

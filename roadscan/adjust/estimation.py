@@ -24,8 +24,8 @@ from roadscan.adjust.observations import COMPONENTS, KINDS
 from roadscan.adjust.settings import AdjustmentSettings
 from roadscan.adjust.sparse_normal import NormalEquations, Rows, SelectedInverse
 from roadscan.adjust.unknowns import Unknowns
-from roadscan.calibrate.robust import length_limit
 from roadscan.compute.array_types import Bool, Float64, Int64
+from roadscan.compute.arrays import length_limit
 
 HUBER_LIMIT: Final = 1.5
 """Huber's limit (σ): at least 95 % efficiency where all is normal."""

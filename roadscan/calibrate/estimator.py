@@ -20,16 +20,7 @@ from roadscan.calibrate.evidence import Evidence, Traverse
 from roadscan.calibrate.observability import Observability, observe
 from roadscan.calibrate.observations import Observations, observations
 from roadscan.calibrate.orientations import Contradiction, OrientationObservations
-from roadscan.calibrate.robust import (
-    Scales,
-    Weighed,
-    independent_share,
-    length_limit,
-    loss,
-    scales_of,
-    variance_factor,
-    weigh,
-)
+from roadscan.calibrate.robust import Scales, Weighed, independent_share, loss, scales_of, variance_factor, weigh
 from roadscan.calibrate.unknowns import (
     MOUNTING,
     Correction,
@@ -41,6 +32,7 @@ from roadscan.calibrate.unknowns import (
     priors_of,
 )
 from roadscan.compute.array_types import Float64
+from roadscan.compute.arrays import length_limit
 from roadscan.core.errors import ConfigError
 from roadscan.core.rig import Mounting
 from roadscan.core.settings.calibration import CalibrationSettings

@@ -25,12 +25,11 @@ from roadscan.calibrate.rotations import exponential, logarithm
 from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.extras import cv2
+from roadscan.core.frames import SENSOR_FROM_OPENCV
 from roadscan.core.rig import Interior, Mounting
 from roadscan.core.settings.calibration import CalibrationSettings
 
 KIND: Final = "resection"
-SENSOR_FROM_OPENCV: Final[Float64] = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""Rotation from OpenCV's axes (right, down, forward) to sensor axes (forward, right, down)."""
 
 _LEAST_MEASURED: Final = 3  # Least number of usable measurements.
 _LEAST_OF_A_PICTURE: Final = 4  # Least number of measurements in a picture from which a start is computed.

@@ -19,6 +19,7 @@ import numpy as np
 
 from roadscan.calibrate.observations import Observations
 from roadscan.compute.array_types import Float64
+from roadscan.compute.arrays import length_limit
 from roadscan.core.settings.calibration import CalibrationSettings
 
 _ENOUGH: Final = 30
@@ -144,16 +145,6 @@ def variance_factor(weighed: Sequence[Weighed], scales: Scales, parameters: floa
     # Normal equations contain the mean weight, Huber's formula the squared share of unclipped residuals.
     clipped = (total_weight / used) / (whole / used) ** 2
     return max(1.0, squares / redundancy * clipped)
-
-
-@cache
-def length_limit(limit: float, rows: int) -> float:
-    """Return the length of `rows` standard normal numbers that is exceeded as rarely as `limit` by one."""
-    from scipy.special import chdtrc, chdtri
-
-    # Farther out, probabilities underflow.
-    usual = min(limit, 30.0)
-    return float(np.sqrt(chdtri(rows, chdtrc(1, usual**2)))) + limit - usual
 
 
 @cache

@@ -15,7 +15,7 @@ from roadscan.colours.tasks.work import MADE, ColourWork, make_gains, make_mosai
 from roadscan.core.errors import RoadscanError
 from roadscan.core.extras import need
 from roadscan.core.survey import Survey
-from roadscan.run.engine.bundles import run_bundles
+from roadscan.run.engine.compute import run_bundles
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState
 from roadscan.tiles.tasks.tiles import run_tasks

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -47,3 +48,13 @@ SIGMA_OF_MAD: Final = 1.4826
 def scatter_about(values: Float64, middle: float | Float64) -> float:
     """Return the robust standard deviation (1.4826 MAD) of values (n,) about a middle, or about one for each (n,)."""
     return SIGMA_OF_MAD * float(np.median(np.abs(values - middle)))
+
+
+@cache
+def length_limit(limit: float, rows: int) -> float:
+    """Return the length of `rows` standard normal numbers that is exceeded as rarely as `limit` by one."""
+    from scipy.special import chdtrc, chdtri
+
+    # Farther out, probabilities underflow.
+    usual = min(limit, 30.0)
+    return float(np.sqrt(chdtri(rows, chdtrc(1, usual**2)))) + limit - usual

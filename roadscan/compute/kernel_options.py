@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from roadscan.core.kept import kept
+from roadscan.core.private_folder import kept
 
 if TYPE_CHECKING:
     import numpy.typing as npt

@@ -13,7 +13,7 @@ from roadscan.core.extras import need
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import plan_of
-from roadscan.run.engine.bundles import run_bundles
+from roadscan.run.engine.compute import run_bundles
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState
 from roadscan.store.logs import LogRecord

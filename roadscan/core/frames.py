@@ -135,3 +135,7 @@ def rotation_from_quaternion(quaternion: Float64) -> Float64:
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
+SENSOR_FROM_OPENCV: Final[Float64] = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""Rotation from OpenCV's axes (right, down, forward) to sensor axes (forward, right, down)."""

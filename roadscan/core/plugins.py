@@ -13,7 +13,7 @@ from types import ModuleType
 from typing import Any, Final, TypeVar, cast
 
 from roadscan.core.errors import ConfigError
-from roadscan.core.kept import kept
+from roadscan.core.private_folder import kept
 
 Kind = TypeVar("Kind")
 _LIBRARY: Final = Path(__file__).parents[1]  # the package folder of roadscan

@@ -23,8 +23,7 @@ from roadscan.georeference.plan.plan import SurveyPlan, plan_of
 from roadscan.georeference.reach import Touched, joined
 from roadscan.georeference.reading_counts import LogCounts, fate_words
 from roadscan.georeference.sources import Georeferencer, MapSettings, RawSlice
-from roadscan.run.engine.bundles import cut_bundles, run_bundles
-from roadscan.run.engine.compute import Compute
+from roadscan.run.engine.compute import Compute, cut_bundles, run_bundles
 from roadscan.run.keys import code_digest, key_of
 from roadscan.run.session import Session, found_once
 from roadscan.run.stage import StageState

@@ -92,7 +92,6 @@ from roadscan.compute.array_types import Bool, Float64, Int64, UInt8, UInt16
 from roadscan.compute.kernel_options import read_only
 from roadscan.core.rig import Mounting, Mountings, ScanGeometry
 from roadscan.core.settings.segmentation import RangeFilter, RoadSegmentation, SegmentationConfig
-from roadscan.georeference.kernels.carriageway import CLASS_OFF_ROAD, CLASS_SCATTERED, keep_road
 from roadscan.georeference.kernels.readings import (
     CLASS_KEPT,
     CLASS_NO_POSE,
@@ -103,7 +102,14 @@ from roadscan.georeference.kernels.readings import (
     CLASS_TOO_NEAR,
     NO_RETURN,
 )
-from roadscan.georeference.kernels.segmentation import CLASS_ABOVE, CLASS_GRAZING, segment_profiles
+from roadscan.georeference.kernels.segmentation import (
+    CLASS_ABOVE,
+    CLASS_GRAZING,
+    CLASS_OFF_ROAD,
+    CLASS_SCATTERED,
+    keep_road,
+    segment_profiles,
+)
 from roadscan.poses.trajectory import Poses, Trajectory
 
 

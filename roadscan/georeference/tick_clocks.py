@@ -25,8 +25,7 @@ from roadscan.navigation.wheel_ticks import (
     WheelTicks,
     judge_ticks,
 )
-from roadscan.run.engine.bundles import cut_bundles, run_bundles
-from roadscan.run.engine.compute import Compute
+from roadscan.run.engine.compute import Compute, cut_bundles, run_bundles
 from roadscan.run.keys import code_digest, key_of
 from roadscan.run.stage import StageState
 from roadscan.store.logs import DataFile, LogRecord

@@ -19,10 +19,9 @@ from roadscan.core.errors import TimeSystemError
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.core.witness import Finding, Witness
 from roadscan.ingest.log_check import LogCheck, Refused, epochs_in
-from roadscan.ingest.overlap import Fault
 from roadscan.ingest.reading.format import LogHeader, Rows
 from roadscan.ingest.reading.records import LEAP_NS
-from roadscan.store.logs import DataFile, LogRecord
+from roadscan.store.logs import DataFile, Fault, LogRecord
 from roadscan.store.writer import LogWriter
 
 TIME_GOES_BACK: Final = Witness(

@@ -38,7 +38,7 @@ from roadscan.core.survey import ClockConfig, Survey
 from roadscan.core.witness import Finding, Witness
 from roadscan.ingest.clock_correction import ClockCorrection
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Rows
-from roadscan.store.logs import NAVIGATION, DataFile, LogRecord
+from roadscan.store.logs import NAVIGATION, DataFile, Fault, LogRecord
 
 Span = tuple[int, int]
 """First and last epoch (GPS ns)."""
@@ -52,22 +52,6 @@ DRIVEN: Final = {"trajectory": "the poses", "gnss": "the GNSS positions"}
 _MOST_HOURS: Final = 14
 """Largest offset of a time zone from UTC (h)."""
 _REASONS: Final = 3  # reasons for rejects that are listed
-
-
-@dataclass(frozen=True)
-class Fault:
-    """A log that contributes nothing, or logs with one common fault, and why."""
-
-    keys: tuple[str, ...]
-    """Keys of the records of the log, or of all logs with this fault."""
-    path: str
-    """Path in the survey file, or several."""
-    reason: str
-
-    @property
-    def told(self) -> tuple[str, str]:
-        """Return unit and reason, as a run lists its failures."""
-        return self.path, self.reason
 
 
 class NothingPlacedError(RunError):

@@ -18,7 +18,7 @@ from roadscan.core.crs import LOCAL_WORLD, crs_from_text
 from roadscan.core.errors import RoadscanError
 from roadscan.core.witness import Witness
 from roadscan.ingest.reading.format import LogHeader
-from roadscan.ingest.reading.poses import GRID_MAX_M
+from roadscan.ingest.reading.records import GRID_MAX_M
 
 VERSION: Final = 2
 """Raised when other records are left out, so that logs of clouds and GNSS are read again."""

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 from roadscan.core.errors import FormatError, StoreError
-from roadscan.core.kept import sources_digest
 from roadscan.core.plugins import added
+from roadscan.core.private_folder import sources_digest
 from roadscan.core.survey import LogConfig, Survey
 from roadscan.core.witness import Finding, Witness
 from roadscan.ingest.inspect.diagnosis import cannot_be_opened, claimed_format, is_there

@@ -9,21 +9,13 @@ from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
 from roadscan.ingest.epoch_order import one_stamp_findings, one_stamp_logs
 from roadscan.ingest.ingest import DATA_TABLES, ingest, ingested_of
-from roadscan.ingest.overlap import (
-    Fault,
-    NothingPlacedError,
-    apart_logs,
-    can_be_placed,
-    empty_logs,
-    reject_findings,
-)
+from roadscan.ingest.overlap import NothingPlacedError, apart_logs, can_be_placed, empty_logs, reject_findings
 from roadscan.ingest.planned_logs import PlannedLog, logs_of
 from roadscan.ingest.reading.format import LogFormat
 from roadscan.ingest.sources import same_content_findings
-from roadscan.run.memory import BYTES_PER_READING, WORKER_BASE_BYTES
 from roadscan.run.session import Session
-from roadscan.run.stage import Stage, StageState
-from roadscan.store.logs import LogRecord, has_log, read_log_records
+from roadscan.run.stage import BYTES_PER_READING, WORKER_BASE_BYTES, Stage, StageState
+from roadscan.store.logs import Fault, LogRecord, has_log, read_log_records
 from roadscan.store.manifest import CHANGED, MISSING, Manifest
 from roadscan.store.salvage import read_lost
 

@@ -27,9 +27,9 @@ from roadscan.measuring.measure import ground_hits
 from roadscan.measuring.poses import PicturePoses, omega_phi_kappa_deg, picture_poses, yaw_pitch_roll_deg
 from roadscan.navigation.tasks.recorded_pictures import TakenPictures
 from roadscan.pictures.exposures import camera_pictures
-from roadscan.pictures.lens import rays_of
+from roadscan.pictures.lens import Lens, rays_of
 from roadscan.pictures.placed import plan_pictures
-from roadscan.pictures.views import HEIGHT, WIDTH, Lens, PictureRule
+from roadscan.pictures.views import HEIGHT, WIDTH, PictureRule
 from roadscan.store.manifest import OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store

@@ -14,10 +14,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from roadscan.calibrate.resection import SENSOR_FROM_OPENCV
 from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.crs import LOCAL_WORLD, geodetic_from_world
-from roadscan.core.frames import rph_from_rotation
+from roadscan.core.frames import SENSOR_FROM_OPENCV, rph_from_rotation
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.grid import of_run
 from roadscan.core.rig import Sensor

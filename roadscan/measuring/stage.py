@@ -12,7 +12,7 @@ from roadscan.core.survey import Survey
 from roadscan.measuring.layer import GEOPACKAGE, PRODUCT, PictureRows, write_picture_package, write_rows
 from roadscan.measuring.settings import PicturesConfig
 from roadscan.measuring.work import all_pictures, row_tasks
-from roadscan.run.engine.bundles import run_bundles
+from roadscan.run.engine.compute import run_bundles
 from roadscan.run.keys import code_digest, key_of
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState

@@ -13,18 +13,18 @@ from typing import Any, Final, Self
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.calibrate.resection import SENSOR_FROM_OPENCV
 from roadscan.compute.array_types import Bool, Float64, Int64, UInt8
 from roadscan.core.errors import RoadscanError
 from roadscan.core.extras import cv2
+from roadscan.core.frames import SENSOR_FROM_OPENCV
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.rig import Interior, Sensor
 from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory_source
 from roadscan.georeference.sources import load_mountings
 from roadscan.navigation.tasks.recorded_pictures import TakenPictures, taken_pictures
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded
+from roadscan.pictures.lens import Lens
 from roadscan.pictures.settings import VideoFramesConfig
-from roadscan.pictures.views import Lens
 from roadscan.poses.trajectory import world_from_ned
 from roadscan.store.codecs.child import Child, ChildError
 from roadscan.store.codecs.image_files import ImageError, image_size

@@ -7,19 +7,31 @@ latitude (Snyder 1987, plate carrée).
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, replace
+from typing import Final, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.compute.array_types import Float64, Int64
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.extras import cv2
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.rig import Interior
-from roadscan.pictures.kernels.lens import ROW_ROUNDS, ROW_SETTLED_PX
-from roadscan.pictures.views import Lens
+from roadscan.pictures.kernels.lens import (
+    AROUND,
+    FOLD,
+    HEIGHT,
+    ROW_ROUNDS,
+    ROW_SETTLED_PX,
+    ROW_SHIFT,
+    ROW_TURN,
+    WIDTH,
+)
+from roadscan.pictures.kernels.lens import (
+    PARAMETERS as NUMBERS,
+)
 from roadscan.store.small_tables import read_small
 from roadscan.store.store import Store
 
@@ -286,3 +298,68 @@ def row_ns(interior: Interior, change: Float64 | None) -> float:
 def clock_ns(change: Float64 | None) -> int:
     """Returns what is added to the stamps of a camera's pictures (ns)."""
     return 0 if change is None else round(float(change[COLUMNS.index("clock_s")]) * NS_PER_S)
+
+
+_STILL: Final = (0.0,) * (NUMBERS - ROW_SHIFT)  # A camera that does not move from row to row.
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Interior orientation of a camera, and the parts of its pictures that show the vehicle."""
+
+    parameters: Float64
+    """(19,) as the kernel takes them."""
+    own_vehicle_px: tuple[tuple[tuple[float, float], ...], ...] = ()
+    """Polygons of pixels (u, v) that show the survey vehicle."""
+
+    @classmethod
+    def of(cls, interior: Interior, own_vehicle_px: tuple[tuple[tuple[float, float], ...], ...] = ()) -> Self:
+        """Returns the lens from the rig's values."""
+        k1, k2, _, _, k3 = interior.distortion
+        size = float(interior.width_px), float(interior.height_px)
+        around = float(interior.model == "equirectangular")
+        lens = [*interior.focal_px, *interior.principal_px, *interior.distortion, _fold(k1, k2, k3), *size, around]
+        return cls(np.array([*lens, *_STILL]), own_vehicle_px)
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Returns width and height of the pictures."""
+        return round(float(self.parameters[WIDTH])), round(float(self.parameters[HEIGHT]))
+
+    @property
+    def fold(self) -> float:
+        """Returns the square of the tangent from which on the distortion is ambiguous."""
+        return float(self.parameters[FOLD])
+
+    @property
+    def row_motion(self) -> tuple[Float64, Float64]:
+        """Returns way (3,; m) and turn (3,; rad) of the camera from row to row, along its axes, in one picture of a
+        rolling shutter; 0 elsewhere.
+        """
+        return self.parameters[ROW_SHIFT:ROW_TURN], self.parameters[ROW_TURN:]
+
+    def moving(self, row_motion: Float64) -> Lens:
+        """Returns the lens in a picture during which the camera moved by so much (6,) from row to row."""
+        return replace(self, parameters=np.concatenate([self.parameters[:ROW_SHIFT], row_motion]))
+
+    @property
+    def is_around(self) -> bool:
+        """Returns True for pictures of 360°."""
+        return bool(self.parameters[AROUND])
+
+    @functools.cached_property
+    def hidden(self) -> Bool:
+        """Mask (height, width) of pixels that show the vehicle; (0, 0) where none does. Computed on demand."""
+        if not self.own_vehicle_px:
+            return np.zeros((0, 0), np.bool_)
+        drawn = np.zeros(self.size_px[::-1], np.uint8)
+        for polygon in self.own_vehicle_px:
+            cv2.fillPoly(drawn, [np.rint(polygon).astype(np.int32)], 1)
+        return drawn.astype(np.bool_)
+
+
+def _fold(k1: float, k2: float, k3: float) -> float:
+    """Returns the square of the tangent at which the distorted radius stops growing: the model is ambiguous beyond."""
+    roots = np.polynomial.Polynomial([1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3]).trim().roots()
+    real = roots[np.abs(roots.imag) < 1e-9].real
+    return float(min(real[real > 0.0], default=np.inf))

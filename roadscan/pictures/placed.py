@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from roadscan.calibrate.resection import SENSOR_FROM_OPENCV
 from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.crs import MapFrame
 from roadscan.core.errors import ConfigError, RunError, nearest
+from roadscan.core.frames import SENSOR_FROM_OPENCV
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.grid import Bounds
 from roadscan.core.rig import Mountings, Rig, Sensor
@@ -25,8 +25,8 @@ from roadscan.georeference.sources import change_of, load_mounting_changes, load
 from roadscan.navigation.tasks.recorded_pictures import TakenPictures
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_trajectory
 from roadscan.pictures.exposures import camera_pictures, folder_of
-from roadscan.pictures.lens import changed, clock_ns, load_camera_changes, row_ns
-from roadscan.pictures.views import Lens, PictureRule, Views
+from roadscan.pictures.lens import Lens, changed, clock_ns, load_camera_changes, row_ns
+from roadscan.pictures.views import PictureRule, Views
 from roadscan.poses.trajectory import Poses, world_from_ned
 
 _PIECE_NS: Final = 600 * NS_PER_S

@@ -2,34 +2,27 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Final, Self
+from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.array_types import Bool, Float64, Int64, UInt8
-from roadscan.core.extras import cv2
-from roadscan.core.rig import Interior
 from roadscan.pictures.kernels.lens import (
     AROUND,
-    FOLD,
     HEIGHT,
-    PARAMETERS,
-    ROW_SHIFT,
-    ROW_TURN,
     WIDTH,
     sample,
     take_better,
 )
+from roadscan.pictures.lens import Lens
 
 __all__ = ["AROUND", "HEIGHT", "NO_VIEW", "WIDTH", "Lens", "PictureRule", "Shown", "Sights", "Views",
            "best_views", "sampled", "sights"]  # fmt: skip
 
 NO_VIEW: Final = -1  # Number that stands for no picture.
-_STILL: Final = (0.0,) * (PARAMETERS - ROW_SHIFT)  # A camera that does not move from row to row.
 _LEAST_TURNED: Final = float(np.sin(np.radians(10.0)))
 """Least cosine between the ray and the direction in which a front faces."""
 
@@ -50,68 +43,6 @@ class PictureRule:
     def limits(self) -> Float64:
         """Returns the limits as the kernel takes them."""
         return np.array([self.reach_m**2, np.sin(np.radians(self.least_angle_deg)), float(self.border_px)])
-
-
-@dataclass(frozen=True)
-class Lens:
-    """Interior orientation of a camera, and the parts of its pictures that show the vehicle."""
-
-    parameters: Float64
-    """(19,) as the kernel takes them."""
-    own_vehicle_px: tuple[tuple[tuple[float, float], ...], ...] = ()
-    """Polygons of pixels (u, v) that show the survey vehicle."""
-
-    @classmethod
-    def of(cls, interior: Interior, own_vehicle_px: tuple[tuple[tuple[float, float], ...], ...] = ()) -> Self:
-        """Returns the lens from the rig's values."""
-        k1, k2, _, _, k3 = interior.distortion
-        size = float(interior.width_px), float(interior.height_px)
-        around = float(interior.model == "equirectangular")
-        lens = [*interior.focal_px, *interior.principal_px, *interior.distortion, _fold(k1, k2, k3), *size, around]
-        return cls(np.array([*lens, *_STILL]), own_vehicle_px)
-
-    @property
-    def size_px(self) -> tuple[int, int]:
-        """Returns width and height of the pictures."""
-        return round(float(self.parameters[WIDTH])), round(float(self.parameters[HEIGHT]))
-
-    @property
-    def fold(self) -> float:
-        """Returns the square of the tangent from which on the distortion is ambiguous."""
-        return float(self.parameters[FOLD])
-
-    @property
-    def row_motion(self) -> tuple[Float64, Float64]:
-        """Returns way (3,; m) and turn (3,; rad) of the camera from row to row, along its axes, in one picture of a
-        rolling shutter; 0 elsewhere.
-        """
-        return self.parameters[ROW_SHIFT:ROW_TURN], self.parameters[ROW_TURN:]
-
-    def moving(self, row_motion: Float64) -> Lens:
-        """Returns the lens in a picture during which the camera moved by so much (6,) from row to row."""
-        return replace(self, parameters=np.concatenate([self.parameters[:ROW_SHIFT], row_motion]))
-
-    @property
-    def is_around(self) -> bool:
-        """Returns True for pictures of 360°."""
-        return bool(self.parameters[AROUND])
-
-    @functools.cached_property
-    def hidden(self) -> Bool:
-        """Mask (height, width) of pixels that show the vehicle; (0, 0) where none does. Computed on demand."""
-        if not self.own_vehicle_px:
-            return np.zeros((0, 0), np.bool_)
-        drawn = np.zeros(self.size_px[::-1], np.uint8)
-        for polygon in self.own_vehicle_px:
-            cv2.fillPoly(drawn, [np.rint(polygon).astype(np.int32)], 1)
-        return drawn.astype(np.bool_)
-
-
-def _fold(k1: float, k2: float, k3: float) -> float:
-    """Returns the square of the tangent at which the distorted radius stops growing: the model is ambiguous beyond."""
-    roots = np.polynomial.Polynomial([1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3]).trim().roots()
-    real = roots[np.abs(roots.imag) < 1e-9].real
-    return float(min(real[real > 0.0], default=np.inf))
 
 
 @dataclass(frozen=True)

@@ -40,8 +40,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.core.crs import Geoid
-from roadscan.core.kept import kept
-from roadscan.core.private_folder import UnsafeFolderError, cache_place, check_private, make_private
+from roadscan.core.private_folder import UnsafeFolderError, cache_place, check_private, kept, make_private
 
 Place: TypeAlias = tuple[str, str | None]
 """A module and a name in it; None for all of the module."""
@@ -51,10 +50,11 @@ Brought: TypeAlias = tuple[str, str, str | None]
 CARRIERS: Final = (
     "roadscan.compute.compiler",
     "roadscan.compute.kernel_options",
-    "roadscan.core.kept",
+    "roadscan.core.private_folder",
     "roadscan.core.plugins",
     "roadscan.run.keys",
     "roadscan.run.engine.compute",
+    "roadscan.run.session",
     "roadscan.core.errors",
     "roadscan.core.extras",
     "roadscan.core.strict",

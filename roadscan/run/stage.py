@@ -178,3 +178,11 @@ def stage_named(name: str) -> Stage:
     if name not in known:
         raise ConfigError(f"unknown stage '{name}'{nearest(name, known)}", expected="one of: " + ", ".join(known))
     return known[name]
+
+
+BYTES_PER_READING: Final = 100
+"""Measured memory of a worker per reading of its block (bytes): points, sorting and one tile's products."""
+
+
+WORKER_BASE_BYTES: Final = 400 << 20
+"""Memory of a worker before its first block (bytes): Python and its libraries."""

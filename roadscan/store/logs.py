@@ -213,3 +213,19 @@ def parse_log_record(content: bytes, key: str, path: str) -> LogRecord:
         ) from error
     _HELD[known] = record
     return record
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A log that contributes nothing, or logs with one common fault, and why."""
+
+    keys: tuple[str, ...]
+    """Keys of the records of the log, or of all logs with this fault."""
+    path: str
+    """Path in the survey file, or several."""
+    reason: str
+
+    @property
+    def told(self) -> tuple[str, str]:
+        """Return unit and reason, as a run lists its failures."""
+        return self.path, self.reason

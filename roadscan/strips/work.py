@@ -24,7 +24,7 @@ from roadscan.georeference.sources import READING_COLUMNS, Georeferencer, MapSet
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded, median_pose_sigma
 from roadscan.poses.movement import level_poses
 from roadscan.poses.trajectory import Trajectory
-from roadscan.run.engine.bundles import run_bundles
+from roadscan.run.engine.compute import run_bundles
 from roadscan.run.keys import code_digest, key_of
 from roadscan.run.session import Session
 from roadscan.store.logs import DataFile

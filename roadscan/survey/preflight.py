@@ -38,19 +38,10 @@ from roadscan.core.rig import SensorKind
 from roadscan.core.survey import ControlConfig, LogConfig, Survey
 from roadscan.core.witness import Witness
 from roadscan.georeference.place import CloudFrame
-from roadscan.georeference.plan.road import CentreLines, load_buffer, looks_across
+from roadscan.georeference.plan.road import centre_lines_of, load_buffer, looks_across
 from roadscan.ingest.epoch_order import one_stamp_logs
 from roadscan.ingest.inspect.diagnosis import cannot_be_opened, claimed_format, is_there
-from roadscan.ingest.overlap import (
-    Fault,
-    LookedAt,
-    NothingPlacedError,
-    key_of_look,
-    look_at,
-    named,
-    never_meeting,
-    no_row,
-)
+from roadscan.ingest.overlap import LookedAt, NothingPlacedError, key_of_look, look_at, named, never_meeting, no_row
 from roadscan.ingest.place_checks import without_fix
 from roadscan.ingest.planned_logs import CONTROL_RUN, log_options, log_source, plan_logs
 from roadscan.ingest.reading.format import LogFormat, LogHeader, LogSource, Reject, Rows, format_alone
@@ -62,7 +53,7 @@ from roadscan.navigation.tasks.odometry_trajectory import LOCAL_MAP
 from roadscan.pictures.frames.stage import no_folder_of_frames
 from roadscan.run.session import Selection
 from roadscan.run.stage import stage_named, stages
-from roadscan.store.logs import has_log, read_log_records
+from roadscan.store.logs import Fault, has_log, read_log_records
 from roadscan.store.store import Store
 from roadscan.surface.settings import SurfaceConfig
 from roadscan.surface.tasks.found_regions import none_across
@@ -494,10 +485,10 @@ def check_centre_lines(asked: Asked) -> Iterator[RoadscanError]:
     """Check that the layer of centre lines can be read and lies on the map."""
     frame = asked.frame
     if frame is not None:
-        for fault in _faults(lambda: CentreLines.of(asked.survey)):
+        for fault in _faults(lambda: centre_lines_of(asked.survey)):
             yield fault
             return
-        lines = CentreLines.of(asked.survey)
+        lines = centre_lines_of(asked.survey)
         if lines is not None:
             yield from _faults(lambda: load_buffer(lines, frame))
 

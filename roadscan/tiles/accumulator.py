@@ -15,8 +15,7 @@ from roadscan.core.grid import QUANTUM_M, TileGrid, TileId
 from roadscan.georeference.cloud import TilePoints
 from roadscan.georeference.kernels.readings import FATES
 from roadscan.georeference.kernels.timed_readings import CHUNK
-from roadscan.run.memory import MOST_CELL_BYTES
-from roadscan.tiles.cells import TileCells, TileEvidence
+from roadscan.tiles.cells import MOST_CELL_BYTES, TileCells, TileEvidence
 from roadscan.tiles.kernels import accumulate
 from roadscan.tiles.kernels import cell_statistics as finishing
 from roadscan.tiles.kernels.accumulate import (

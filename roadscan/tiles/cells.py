@@ -158,7 +158,7 @@ def pyramid_of(cells: TileCells, factors: Sequence[int]) -> list[Level]:
     rounded: exact up to 128 readings of 65,535 a cell). Raises :class:`ConfigError` for factors that do not
     divide the tile's edge or are not ascending multiples of one another.
     """
-    from roadscan.tiles.kernels.decimate import Cells
+    from roadscan.tiles.kernels.pyramid import Cells
 
     edge = cells.cells_per_edge
     _check(edge, factors)
@@ -311,3 +311,7 @@ def _stored(table: str, columns: CellColumns) -> pa.Schema:
     if columns == "full":  # all columns are present without nulls: levels of nulls would take time
         return pa.schema([f.with_nullable(False) for f in schema])
     return pa.schema([f for f in schema if not f.nullable])
+
+
+MOST_CELL_BYTES: Final = 800 << 20
+"""Memory that the cells of active tiles may take (bytes)."""

@@ -15,11 +15,11 @@ from roadscan.footprints.stage import faults_of_plan
 from roadscan.georeference.plan.plan import plan_of
 from roadscan.georeference.reading_counts import LogCounts, fate_words, lost_findings
 from roadscan.run.engine.compute import LazyTasks
-from roadscan.run.memory import BYTES_PER_READING, MOST_CELL_BYTES, WORKER_BASE_BYTES
 from roadscan.run.session import Session
-from roadscan.run.stage import Stage, StageState, check_stages_ahead
+from roadscan.run.stage import BYTES_PER_READING, WORKER_BASE_BYTES, Stage, StageState, check_stages_ahead
 from roadscan.store.logs import LogRecord
 from roadscan.store.manifest import Manifest, OutputRecord
+from roadscan.tiles.cells import MOST_CELL_BYTES
 from roadscan.tiles.product import TileProduct, tile_file_names
 from roadscan.tiles.tasks.tile_figures import apart_findings, reading_counts, tile_figures
 from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, TilePlan, TileTask, stale_tiles, tiles_of

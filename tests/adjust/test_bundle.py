@@ -21,8 +21,7 @@ from roadscan.core.frames import ENU_FROM_NED
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.rig import Interior, Sensor
 from roadscan.pictures.exposures import Camera, Exposures
-from roadscan.pictures.lens import pixels_of
-from roadscan.pictures.views import Lens
+from roadscan.pictures.lens import Lens, pixels_of
 from roadscan.poses.trajectory import Corrections
 
 Float64 = npt.NDArray[np.float64]

@@ -24,8 +24,7 @@ from roadscan.adjust.observations import CAMERA, CameraPrior, MountingPrior, Obs
 from roadscan.adjust.settings import AdjustmentSettings
 from roadscan.core.frames import ENU_FROM_NED
 from roadscan.core.rig import Interior
-from roadscan.pictures.lens import pixels_of
-from roadscan.pictures.views import Lens
+from roadscan.pictures.lens import Lens, pixels_of
 from tests.adjust.test_bundle import LENS, Block, Drive, simulated_drive
 
 Float64 = npt.NDArray[np.float64]

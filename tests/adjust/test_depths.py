@@ -10,8 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from roadscan.adjust.adjustment import adjust
-from roadscan.adjust.bundle.depths import NearReturns, Surfaces, depth_rows, surfaces_of
-from roadscan.adjust.bundle.measurements import State, met_at, seen
+from roadscan.adjust.bundle.measurements import NearReturns, State, Surfaces, depth_rows, met_at, seen, surfaces_of
 from roadscan.adjust.bundle.solve import Approached, approached, state_of
 from roadscan.adjust.observations import MountingPrior, Observations
 from roadscan.adjust.settings import AdjustmentSettings

@@ -32,7 +32,7 @@ from roadscan.adjust.observations import CameraPrior, GaussMarkov, MountingPrior
 from roadscan.adjust.settings import AdjustmentSettings
 from roadscan.adjust.tasks.edge_scores import boresight_findings
 from roadscan.core.rig import Interior
-from roadscan.pictures.views import Lens
+from roadscan.pictures.lens import Lens
 from tests.adjust.test_bundle import BORESIGHT_RAD, Block, simulated_drive
 
 Float64 = npt.NDArray[np.float64]

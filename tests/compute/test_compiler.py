@@ -204,7 +204,7 @@ def test_a_changed_kernel_changes_the_folder_of_all_that_import_it(tmp_path: Pat
         "__init__.py",
         "core/__init__.py",
         "core/private_folder.py",
-        "core/kept.py",
+        "core/private_folder.py",
         *(f"compute/{n}" for n in COMPUTE),
     ):
         (tmp_path / "roadscan" / name).parent.mkdir(parents=True, exist_ok=True)

@@ -15,7 +15,7 @@ import shapely
 from roadscan.core.errors import ConfigError, CrsError
 from roadscan.core.survey import Survey
 from roadscan.georeference.plan.plan import plan_survey
-from roadscan.georeference.plan.road import CentreLineBuffer, CentreLines, load_buffer
+from roadscan.georeference.plan.road import CentreLineBuffer, centre_lines_of, load_buffer
 from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
@@ -121,12 +121,12 @@ def test_road_lines_are_a_table(tmp_path: Path) -> None:
 def test_what_the_survey_file_has_to_say(tmp_path: Path) -> None:
     survey = survey_of(tmp_path)
     with pytest.raises(ConfigError, match="layer does not exist"):
-        CentreLines.of(survey)
+        centre_lines_of(survey)
     write_layer(tmp_path / "roads.shp", crs=None)
 
     def load(**filters: Any) -> object:
         changed = survey_of(tmp_path, **filters)
-        stated = CentreLines.of(changed)
+        stated = centre_lines_of(changed)
         assert stated is not None
         return load_buffer(stated, changed.frame())
 
@@ -143,7 +143,7 @@ def test_what_the_survey_file_has_to_say(tmp_path: Path) -> None:
 
 def buffer_of(folder: Path, **filters: Any) -> CentreLineBuffer:
     survey = survey_of(folder, **filters)
-    stated = CentreLines.of(survey)
+    stated = centre_lines_of(survey)
     assert stated is not None
     return load_buffer(stated, survey.frame())
 

@@ -30,9 +30,8 @@ from roadscan.tiles.kernels.cell_statistics import (
     select_arrays,
     statistics_of_full,
 )
-from roadscan.tiles.kernels.decimate import Cells
 from roadscan.tiles.kernels.grey_pictures import grey_intensity, shade_cells, shade_raster
-from roadscan.tiles.kernels.pyramid import Levels, Pixels, reduce_cells, run_end
+from roadscan.tiles.kernels.pyramid import Cells, Levels, Pixels, reduce_cells, run_end
 from roadscan.tiles.kernels.row_buckets import (
     BLOCK,
     PASS,

@@ -17,7 +17,7 @@ LIBRARY = ROOT / "roadscan"
 THROUGH_ITS_CALLER = {
     "tiles.kernels.bucket_statistics.bucket_mirror": "tests/tiles/test_cell_path.py",
     "tiles.kernels.bucket_statistics.bucket_returns": "tests/tiles/test_cell_path.py",
-    "tiles.kernels.profile_counting.accumulate_profiles": "tests/tiles/test_cell_path.py",
+    "tiles.kernels.accumulate.accumulate_profiles": "tests/tiles/test_cell_path.py",
     "condition.kernels.sampling.median": "tests/condition/test_lane_texture.py",
     "condition.kernels.sampling.smallest": "tests/condition/test_lane_texture.py",
     "surface.kernels.faint_cracks.confirm_strips": "tests/surface/test_faint_cracks.py",
@@ -37,7 +37,7 @@ THROUGH_ITS_CALLER = {
     "navigation.inertial.kernels.kalman_updates.apply": "tests/navigation/test_inertial_smoother.py",
     "navigation.inertial.kernels.kalman_updates.offered": "tests/navigation/test_inertial_smoother.py",
     "navigation.inertial.kernels.kalman_updates.prepare": "tests/navigation/test_inertial_smoother.py",
-    "georeference.kernels.carriageway.mark_off_road": "tests/georeference/test_segmentation.py",
+    "georeference.kernels.segmentation.mark_off_road": "tests/georeference/test_segmentation.py",
     "georeference.kernels.segmentation.fitted": "tests/georeference/test_segmentation.py",
     "georeference.kernels.segmentation.segment_profiles": "tests/georeference/test_segmentation.py",
     "surface.kernels.delaunay.in_circle": "tests/kernels/test_natural_neighbour.py",

@@ -14,7 +14,7 @@ from roadscan.calibrate.kernels.ties import SIDE, tie_residuals, tie_rows
 from roadscan.compute.kernels.arrays import range_bounds
 from roadscan.compute.kernels.curved_grid import accumulate_curved, thin_path
 from roadscan.distress.kernels.crack_response import add_bend, deepen, fill_holes, line_sums, thin
-from roadscan.georeference.kernels.carriageway import keep_road
+from roadscan.georeference.kernels.segmentation import keep_road
 from roadscan.georeference.kernels.tile_set import add_tile, block_ranges, empty, mark_zonotope, take, tile_set
 from roadscan.georeference.kernels.timed_readings import between_ticks
 from roadscan.navigation.inertial.kernels.strapdown import geodetic_of, gravity_at, turned_frame

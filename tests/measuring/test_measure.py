@@ -19,8 +19,7 @@ from roadscan.core.survey import Survey
 from roadscan.georeference.sources import MOUNTING_COLUMNS
 from roadscan.measuring.kernels.march import BELOW, NO_GROUND, first_hits
 from roadscan.measuring.measure import length_of, measure, meet
-from roadscan.pictures.lens import COLUMNS, pixels_of, rays_of
-from roadscan.pictures.views import Lens
+from roadscan.pictures.lens import COLUMNS, Lens, pixels_of, rays_of
 from roadscan.run.session import Session
 from roadscan.site.where import pictures_of_place
 from roadscan.store.small_tables import write_small

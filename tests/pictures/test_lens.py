@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from roadscan.core.rig import Interior
-from roadscan.pictures.lens import changed, derivatives, pixels_of, rays_of
-from roadscan.pictures.views import Lens
+from roadscan.pictures.lens import Lens, changed, derivatives, pixels_of, rays_of
 
 LENS = Interior(
     width_px=1024, height_px=640, focal_px=(784.0, 781.0), principal_px=(515.2, 317.1),

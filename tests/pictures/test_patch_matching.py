@@ -11,11 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.core.rig import Interior
 from roadscan.pictures.kernels.patch_matching import match_patches
-from roadscan.pictures.lens import pixels_of
+from roadscan.pictures.lens import Lens, pixels_of
 from roadscan.pictures.ties.refining import _forms
 from roadscan.pictures.ties.tracks import Chains
 from roadscan.pictures.ties.work import TieWork
-from roadscan.pictures.views import Lens
 
 SIZE = 400
 

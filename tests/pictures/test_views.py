@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.core.errors import ConfigError
 from roadscan.core.rig import Interior
-from roadscan.pictures.views import NO_VIEW, Lens, PictureRule, Views, best_views, sampled
+from roadscan.pictures.lens import Lens
+from roadscan.pictures.views import NO_VIEW, PictureRule, Views, best_views, sampled
 
 LENSES = (
     Interior(width_px=640, height_px=400, focal_px=(410.0, 405.0), principal_px=(322.0, 195.0),

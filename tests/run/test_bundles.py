@@ -16,8 +16,7 @@ from roadscan.core.survey import Survey
 from roadscan.footprints import footprints
 from roadscan.footprints.footprints import PRODUCT, index_footprints
 from roadscan.georeference.plan.plan import plan_survey
-from roadscan.run.engine.bundles import cut_bundles, run_bundles
-from roadscan.run.engine.compute import Done, Inline
+from roadscan.run.engine.compute import Done, Inline, cut_bundles, run_bundles
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.store import Store
 from roadscan.tiles.mosaics import products

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from roadscan.arrays import write_profiles, write_trajectory
 from roadscan.cli import app
-from roadscan.store.codecs.tiff import without_place_warning
+from roadscan.store.codecs.cog import without_place_warning
 
 SURVEY = """
 id = "road"

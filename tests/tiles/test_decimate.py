@@ -9,8 +9,9 @@ from roadscan.compute.kernel_options import read_only
 from roadscan.core.errors import ConfigError
 from roadscan.core.grid import TileGrid, TileId
 from roadscan.tiles.cells import TileCells
-from roadscan.tiles.kernels.decimate import Cells, Squares, decimate_cells
+from roadscan.tiles.kernels.decimate import Squares, decimate_cells
 from roadscan.tiles.kernels.decimate_2x2 import decimate_2x2
+from roadscan.tiles.kernels.pyramid import Cells
 from roadscan.tiles.products.model_las import FLOOR_UM, cells_per_square, decimate, patch_cells
 
 EDGE = 40  # cells of 5 mm: a tile of 20 cm

@@ -27,8 +27,7 @@ from roadscan.adjust.kernels.range_edges import continued, scores_of_turns
 from roadscan.adjust.observations import CAMERA, COMPONENTS, FIXED, KINDS, MOUNTED, MountingPrior, Observations
 from roadscan.compute.array_types import Float32, Float64, UInt8
 from roadscan.core.extras import cv2
-from roadscan.pictures.lens import PARAMETERS, derivatives
-from roadscan.pictures.views import Lens
+from roadscan.pictures.lens import PARAMETERS, Lens, derivatives
 
 TURNS_DEG: Final = (np.linspace(-1.8, 1.8, 31), np.linspace(-1.8, 1.8, 31), np.linspace(-2.4, 2.4, 17))
 """Turns that are tried about the camera's axes right, down and ahead (degrees): ± 1.5° and some more, so that the best

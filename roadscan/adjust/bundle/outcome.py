@@ -18,9 +18,8 @@ from typing import Final
 import numpy as np
 
 from roadscan.adjust.adjustment import Adjustment, CameraErrors, adjust
-from roadscan.adjust.bundle.depths import Surfaces, depth_rows
 from roadscan.adjust.bundle.edge_boresight import EdgeBoresight
-from roadscan.adjust.bundle.measurements import Measurements, State, met_at, residuals_px, seen
+from roadscan.adjust.bundle.measurements import Measurements, State, Surfaces, depth_rows, met_at, residuals_px, seen
 from roadscan.adjust.bundle.solve import Approached, PictureEvidence, entering, places, sharing, state_of
 from roadscan.adjust.control import ControlPoint
 from roadscan.adjust.observations import CAMERA, COMPONENTS, KINDS, CameraPrior, MountingPrior, Observations

@@ -9,24 +9,28 @@ from typing import Final
 import numpy as np
 
 from roadscan.adjust.adjustment import Adjustment, MountingErrors, adjust
-from roadscan.adjust.bundle.depths import DepthRows, NearReturns, Surfaces, depth_rows, surfaces_of
 from roadscan.adjust.bundle.edge_boresight import KIND, EdgeBoresight
 from roadscan.adjust.bundle.measurements import (
+    DepthRows,
     Measurements,
+    NearReturns,
     Numbers,
     Rows,
     Seen,
     State,
+    Surfaces,
+    depth_rows,
     met_at,
     residuals_px,
     rows_of,
     seen,
+    surfaces_of,
 )
 from roadscan.adjust.estimation import igg_iii
 from roadscan.adjust.observations import KINDS, CameraPrior, MountingPrior, Observations, RunPrior
 from roadscan.adjust.settings import AdjustmentSettings
-from roadscan.calibrate.robust import length_limit
 from roadscan.compute.array_types import Bool, Float64, Int64
+from roadscan.compute.arrays import length_limit
 
 _MOST: Final = 14  # Solutions on the way, at most; eight are usual.
 _ROUNDS: Final = 2

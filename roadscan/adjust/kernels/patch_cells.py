@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.calibrate.kernels.surface_patches import catmull_rom, sampled
 from roadscan.compute.kernel_options import bare, kernel
+from roadscan.compute.kernels.arrays import catmull_rom, sampled
 
 MOST = 32
 """Readings of a cell from which its height is computed; an even choice where there are more."""

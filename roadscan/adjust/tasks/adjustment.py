@@ -92,7 +92,7 @@ from roadscan.adjust.tasks.tracks import (
     steps_of,
     tracks_of,
 )
-from roadscan.adjust.walls import lean_findings, leans
+from roadscan.adjust.ties.plane import lean_findings, leans
 from roadscan.compute.array_types import Float64
 from roadscan.core.counted import counted as count_of
 from roadscan.core.counted import listed
@@ -102,7 +102,7 @@ from roadscan.georeference.plan.plan import SurveyPlan, poses_plan_of
 from roadscan.georeference.plan.road import road_key
 from roadscan.navigation.tasks.recorded_pictures import NOT_DRAWN
 from roadscan.poses.movement import largest
-from roadscan.run.engine.bundles import run_bundles
+from roadscan.run.engine.compute import run_bundles
 from roadscan.run.keys import code_digest, key_of
 from roadscan.run.session import Session
 from roadscan.store.digest import file_digest

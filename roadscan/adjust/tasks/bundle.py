@@ -34,8 +34,7 @@ from roadscan.georeference.sources import load_mountings
 from roadscan.navigation.tasks.clock_tables import load_clocks
 from roadscan.pictures.exposures import Exposures, camera_pictures, exposures_of
 from roadscan.pictures.points import TABLE, measured_points
-from roadscan.pictures.ties.tracks import TRACKS
-from roadscan.pictures.ties.work import ALL
+from roadscan.pictures.ties.tracks import ALL, TRACKS
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.store import Store
 

@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from roadscan.adjust.bundle.depths import NearReturns
 from roadscan.adjust.bundle.edge_boresight import (
     OTHERS,
     TURNS_DEG,
@@ -20,7 +19,7 @@ from roadscan.adjust.bundle.edge_boresight import (
     boresight_of,
     scores_of,
 )
-from roadscan.adjust.bundle.measurements import Numbers
+from roadscan.adjust.bundle.measurements import NearReturns, Numbers
 from roadscan.adjust.settings import CameraPriors
 from roadscan.adjust.tasks.mountings import DOUBTED, Mounted, camera_sigma
 from roadscan.adjust.tasks.near import NearFile, placed_readings

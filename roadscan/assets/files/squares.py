@@ -14,8 +14,7 @@ from roadscan.assets.scene import Box, GroundModel, Returns
 from roadscan.core.errors import StoreError
 from roadscan.core.grid import QUANTA_PER_M, TileGrid, TileId
 from roadscan.georeference.cloud import TilePoints
-from roadscan.store.codecs.cog import Band, dense_image, write_cog
-from roadscan.store.codecs.tiff import raster_settings
+from roadscan.store.codecs.cog import Band, dense_image, raster_settings, write_cog
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.las import LasOptions, write_las
 from roadscan.tiles.products.raster import about, height_unit

@@ -21,6 +21,7 @@ from roadscan.core.strict import Strict
 from roadscan.core.survey import Survey
 from roadscan.footprints.footprints import FootprintRanges
 from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
+from roadscan.georeference.plan.road import centre_lines_key
 from roadscan.georeference.sources import ReadingSource, geometry_of
 from roadscan.navigation.tasks.trajectories import TrajectorySource
 from roadscan.pictures.placed import rule_cameras
@@ -203,8 +204,8 @@ def plan_assets(plan: SurveyPlan, footprints: FootprintRanges) -> AssetPlan:
     chosen = sorted({source.sensor for source, _ in plan.sources if is_looked_at(source, config)})
     ways = _ways(plan, config)
     common = key_of(
-        chosen, config.ground.model_dump(mode="json"), None if plan.centre_lines is None else
-        plan.centre_lines.key(), [[w.world, [f.digest for f in w.files], _corrections(plan, run)] for run, w in ways],
+        chosen, config.ground.model_dump(mode="json"), centre_lines_key(plan.centre_lines),
+        [[w.world, [f.digest for f in w.files], _corrections(plan, run)] for run, w in ways],
         [str(width) for width in _divergences(plan.survey, chosen)],
     )  # fmt: skip
     own = _looked_at(footprints, config)

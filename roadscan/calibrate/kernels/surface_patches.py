@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.compute.kernel_options import inlined, kernel
+from roadscan.compute.kernel_options import kernel
+from roadscan.compute.kernels.arrays import catmull_rom, sampled
 
 UNKNOWNS = 5
 """Unknowns of a patch: shift along x, y, z, and two tilts that are eliminated afterwards."""
@@ -87,29 +88,6 @@ def splat(place_m, pose, corner_x, corner_y, cell, mass, height, carrier):
                 mass[r + j, c + k] += w
                 height[r + j, c + k] += w * z
         carrier[r + (1 if fv > 0.5 else 0), c + (1 if fu > 0.5 else 0)] = pose[i]
-
-
-@inlined
-def catmull_rom(s):
-    """Return Catmull–Rom weights of four neighbours at fraction `s` between the middle two, then their derivatives."""
-    return (
-        s * (-0.5 + s * (1.0 - 0.5 * s)), 1.0 + s * s * (-2.5 + 1.5 * s),
-        s * (0.5 + s * (2.0 - 1.5 * s)), s * s * (-0.5 + 0.5 * s),
-        -0.5 + s * (2.0 - 1.5 * s), s * (-5.0 + 4.5 * s), 0.5 + s * (4.0 - 4.5 * s), s * (-1.0 + 1.5 * s),
-    )  # fmt: skip
-
-
-@inlined
-def sampled(image, r, c, s, t):
-    """Return value and derivatives by column and row (per cell) of an image beyond (r, c), with weights `s` and `t`."""
-    value, along, across = 0.0, 0.0, 0.0
-    for j in range(4):
-        a, b, d, e = image[r - 1 + j, c - 1], image[r - 1 + j, c], image[r - 1 + j, c + 1], image[r - 1 + j, c + 2]
-        row = s[0] * a + s[1] * b + s[2] * d + s[3] * e
-        value += t[j] * row
-        along += t[j] * (s[4] * a + s[5] * b + s[6] * d + s[7] * e)
-        across += t[4 + j] * row
-    return value, along, across
 
 
 @kernel

@@ -120,3 +120,26 @@ def smallest(values, k, bins, found):
         values, k = values[:n], k - before
     sort_few(values)
     return np.int64(values[k])
+
+
+@inlined
+def catmull_rom(s):
+    """Return Catmull–Rom weights of four neighbours at fraction `s` between the middle two, then their derivatives."""
+    return (
+        s * (-0.5 + s * (1.0 - 0.5 * s)), 1.0 + s * s * (-2.5 + 1.5 * s),
+        s * (0.5 + s * (2.0 - 1.5 * s)), s * s * (-0.5 + 0.5 * s),
+        -0.5 + s * (2.0 - 1.5 * s), s * (-5.0 + 4.5 * s), 0.5 + s * (4.0 - 4.5 * s), s * (-1.0 + 1.5 * s),
+    )  # fmt: skip
+
+
+@inlined
+def sampled(image, r, c, s, t):
+    """Return value and derivatives by column and row (per cell) of an image beyond (r, c), with weights `s` and `t`."""
+    value, along, across = 0.0, 0.0, 0.0
+    for j in range(4):
+        a, b, d, e = image[r - 1 + j, c - 1], image[r - 1 + j, c], image[r - 1 + j, c + 1], image[r - 1 + j, c + 2]
+        row = s[0] * a + s[1] * b + s[2] * d + s[3] * e
+        value += t[j] * row
+        along += t[j] * (s[4] * a + s[5] * b + s[6] * d + s[7] * e)
+        across += t[4 + j] * row
+    return value, along, across

@@ -24,8 +24,7 @@ from roadscan.export.export import Exported, published
 from roadscan.measuring.measure import posed_pictures
 from roadscan.measuring.poses import PicturePoses, yaw_pitch_roll_deg
 from roadscan.measuring.work import picked_poses
-from roadscan.pictures.lens import matrix_of
-from roadscan.pictures.views import Lens
+from roadscan.pictures.lens import Lens, matrix_of
 from roadscan.poses.trajectory import world_from_ned
 from roadscan.privacy.hider import Hider, decoded, encoded, hider_of
 from roadscan.run.session import Session

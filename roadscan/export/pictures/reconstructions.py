@@ -34,10 +34,9 @@ from roadscan.export.pictures.copies import (
 from roadscan.georeference.picture_axes import map_from_ned
 from roadscan.measuring.measure import posed_pictures
 from roadscan.measuring.poses import PicturePoses
-from roadscan.pictures.lens import rays_of
-from roadscan.pictures.ties.tracks import TRACKS, places_of
-from roadscan.pictures.ties.work import ALL
-from roadscan.pictures.views import Lens, Views
+from roadscan.pictures.lens import Lens, rays_of
+from roadscan.pictures.ties.tracks import ALL, TRACKS, places_of
+from roadscan.pictures.views import Views
 from roadscan.run.session import Session
 from roadscan.store.manifest import recorded_table
 

@@ -22,8 +22,7 @@ from roadscan.core.crs import LOCAL_WORLD, NO_HEIGHTS, HeightKind, crs_from_text
 from roadscan.core.errors import ConfigError, CrsError, Missing, TimeSystemError
 from roadscan.core.gpstime import LATEST_GPS_NS, gps_ns_from_utc
 from roadscan.core.strict import Strict
-from roadscan.ingest.reading.format import Item, LogSource, Rows
-from roadscan.ingest.reading.poses import height_in
+from roadscan.ingest.reading.format import Item, LogSource, Rows, height_in
 from roadscan.ingest.reading.records import Sieve, few_rejects
 
 Columns = dict[str, npt.NDArray[Any]]

@@ -16,7 +16,7 @@ from roadscan.core.crs import LOCAL_WORLD, crs_from_text, world_from_geodetic
 from roadscan.core.errors import ConfigError, CrsError, FormatError, Missing, RoadscanError, TimeSystemError
 from roadscan.core.gpstime import GPS_EPOCH_UNIX_S, NS_PER_S, WEEK_S, Clock, TimeSystem
 from roadscan.core.strict import Strict
-from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
+from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, height_in
 from roadscan.ingest.reading.gnss import (
     QUALITIES,
     UNKNOWN_QUALITY,
@@ -26,14 +26,7 @@ from roadscan.ingest.reading.gnss import (
     ned_from_ecef,
     signed_square,
 )
-from roadscan.ingest.reading.poses import (
-    SIGMA_MAX_M,
-    GeodeticPlacement,
-    LevelPlacement,
-    Placement,
-    check_geographic,
-    height_in,
-)
+from roadscan.ingest.reading.poses import SIGMA_MAX_M, GeodeticPlacement, LevelPlacement, Placement, check_geographic
 from roadscan.ingest.reading.records import EpochReader, Sieve, options_of
 from roadscan.ingest.reading.stamps import parse_calendar
 from roadscan.ingest.reading.text_table import Kind, TextBlock, TextLayout, first_fields, head_of, text_blocks

@@ -20,8 +20,6 @@ from roadscan.core.strict import Strict
 from roadscan.core.toml_text import toml
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, beside
 from roadscan.ingest.reading.poses import (
-    HEIGHT_MAX_M,
-    HEIGHT_MIN_M,
     SIGMA_MAX_DEG,
     SIGMA_MAX_M,
     GeodeticPlacement,
@@ -32,7 +30,7 @@ from roadscan.ingest.reading.poses import (
     check_sigmas,
     ned_from_rph,
 )
-from roadscan.ingest.reading.records import LEAP_NS, EpochReader, Sieve, options_of
+from roadscan.ingest.reading.records import HEIGHT_MAX_M, HEIGHT_MIN_M, LEAP_NS, EpochReader, Sieve, options_of
 from roadscan.ingest.reading.text_table import byte_pieces, head_of
 
 FIELDS: Final = 10  # doubles of a record

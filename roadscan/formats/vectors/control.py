@@ -26,9 +26,8 @@ from roadscan.core.crs import (
 )
 from roadscan.core.errors import ConfigError, CrsError, Missing
 from roadscan.core.witness import Finding, Witness
-from roadscan.ingest.reading.format import Item, LogSource, Rows
-from roadscan.ingest.reading.poses import GRID_MAX_M, HEIGHT_MAX_M, HEIGHT_MIN_M, height_in
-from roadscan.ingest.reading.records import Sieve, drop_failing
+from roadscan.ingest.reading.format import Item, LogSource, Rows, height_in
+from roadscan.ingest.reading.records import GRID_MAX_M, HEIGHT_MAX_M, HEIGHT_MIN_M, NO_TEXT, Sieve, drop_failing
 
 Index = Int64 | slice
 
@@ -48,8 +47,6 @@ _COARSE_SIGMA_M: Final = 0.5
 """σ (m) of a point that is too coarse for a drive, as from hand-held receivers, or from 0.5 mm given as metres."""
 _FINE_SIGMA_M: Final = 5e-5
 """Least credible σ (m) of a road point: precise levelling reaches 0.2 mm over a kilometre."""
-NO_TEXT: Final = "\ufffd"
-"""Replaces bytes that could not be decoded."""
 
 
 @dataclass(frozen=True)

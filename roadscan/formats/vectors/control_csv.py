@@ -25,8 +25,7 @@ from roadscan.ingest.reading.columns import (
     is_sexagesimal,
 )
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
-from roadscan.ingest.reading.poses import GRID_MAX_M, HEIGHT_MAX_M, HEIGHT_MIN_M
-from roadscan.ingest.reading.records import options_of
+from roadscan.ingest.reading.records import GRID_MAX_M, HEIGHT_MAX_M, HEIGHT_MIN_M, options_of
 from roadscan.ingest.reading.text_table import (
     Kind,
     TextBlock,

@@ -17,15 +17,7 @@ from roadscan.compute.array_types import Float64
 from roadscan.core.crs import LOCAL_WORLD, crs_from_text
 from roadscan.core.errors import ConfigError, CrsError, FormatError, RoadscanError, nearest
 from roadscan.core.strict import Strict
-from roadscan.formats.vectors.control import (
-    NO_TEXT,
-    SIGMA_MAX_M,
-    ControlFrame,
-    ControlReader,
-    RawControl,
-    Role,
-    need_role,
-)
+from roadscan.formats.vectors.control import SIGMA_MAX_M, ControlFrame, ControlReader, RawControl, Role, need_role
 from roadscan.formats.vectors.control_csv import GEODETIC, GRID, HEIGHT, LOCAL, SIGMAS, units_of
 from roadscan.formats.vectors.vector_layer import (
     LINE_KINDS,
@@ -45,7 +37,7 @@ from roadscan.formats.vectors.vector_layer import (
 )
 from roadscan.ingest.reading.columns import UNITS, ColumnOption, Quantity, find_columns
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
-from roadscan.ingest.reading.records import Sieve, options_of
+from roadscan.ingest.reading.records import NO_TEXT, Sieve, options_of
 from roadscan.ingest.reading.text_table import Kind, TextOptions, sniff_layout, text_blocks, text_layout
 
 

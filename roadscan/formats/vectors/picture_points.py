@@ -13,7 +13,7 @@ import pyarrow as pa
 from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.errors import FormatError, nearest
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
-from roadscan.ingest.reading.records import Sieve, options_of
+from roadscan.ingest.reading.records import NO_TEXT, Sieve, options_of
 from roadscan.ingest.reading.text_table import (
     Kind,
     TextBlock,
@@ -29,7 +29,6 @@ BY_HAND, FOUND = "by hand", "found"
 """Sources of measurements."""
 _FARTHEST_PX: Final = 200_000.0  # places farther from a picture's corner count as damage (pixels)
 _LARGEST_SIGMA_PX: Final = 1_000.0  # larger σ count as damage (pixels)
-_NO_TEXT: Final = "\ufffd"  # replaces bytes that could not be decoded
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,7 @@ def point_items(raw: RawPoints) -> Iterator[Item]:
     sieve.drop(np.array([not picture for picture, _ in names], bool), "the picture has no name")
     sieve.drop(np.array([not point for _, point in names], bool), "the point has no name")
     texts = zip(raw.runs, raw.sensors, names, strict=True)
-    sieve.drop(np.array([_NO_TEXT in f"{run}{sensor}{name}" for run, sensor, name in texts], bool), "a name is no text")
+    sieve.drop(np.array([NO_TEXT in f"{run}{sensor}{name}" for run, sensor, name in texts], bool), "a name is no text")
     sieve.require("u_px", raw.uv_px[0], -_FARTHEST_PX, _FARTHEST_PX, "px")
     sieve.require("v_px", raw.uv_px[1], -_FARTHEST_PX, _FARTHEST_PX, "px")
     stated = ~np.isnan(raw.sigma_px)

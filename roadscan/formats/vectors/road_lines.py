@@ -33,7 +33,6 @@ from roadscan.compute.array_types import Bool, Float64
 from roadscan.core.crs import LOCAL_WORLD, MapFrame, crs_from_text, world_from_geodetic
 from roadscan.core.errors import ConfigError, CrsError, FormatError, nearest
 from roadscan.core.strict import Strict
-from roadscan.formats.vectors.control import NO_TEXT
 from roadscan.formats.vectors.vector_layer import (
     LINE_KINDS,
     attribute_values,
@@ -53,8 +52,7 @@ from roadscan.formats.vectors.vector_layer import (
 )
 from roadscan.ingest.reading.columns import UNITS
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Provisional, Reject, Rows
-from roadscan.ingest.reading.poses import GRID_MAX_M
-from roadscan.ingest.reading.records import Sieve, options_of
+from roadscan.ingest.reading.records import GRID_MAX_M, NO_TEXT, Sieve, options_of
 
 _EXPECTED: Final = "a layer of lines"
 _SHAPE_CODE: Final = 9994  # magic number of a shapefile

@@ -21,7 +21,7 @@ from roadscan.core.grid import LanePass, RunId, TileGrid, of_run
 from roadscan.core.rig import UNMOUNTED, Mounting, Mountings, Rig, Sensor
 from roadscan.core.survey import Survey
 from roadscan.georeference.place import HeightLimits
-from roadscan.georeference.plan.road import CentreLines, check_road, road_of
+from roadscan.georeference.plan.road import CentreLines, centre_lines_key, centre_lines_of, check_road, road_of
 from roadscan.georeference.road_profiles import TICK_NS, WINDOW_NS
 from roadscan.georeference.sources import (
     MapSettings,
@@ -34,7 +34,7 @@ from roadscan.georeference.sources import (
 )
 from roadscan.ingest.epoch_order import one_stamp_logs
 from roadscan.ingest.ingest import DATA_TABLES
-from roadscan.ingest.overlap import Fault, NothingPlacedError, apart_logs
+from roadscan.ingest.overlap import NothingPlacedError, apart_logs
 from roadscan.ingest.reading.format import known_format
 from roadscan.ingest.sources import same_points
 from roadscan.navigation.tasks.clocks import load_clocks
@@ -44,7 +44,7 @@ from roadscan.poses.movement import Allowance, allowance_for, largest
 from roadscan.poses.trajectory import STENCIL_KNOTS, Corrections
 from roadscan.run.keys import code_digest, grid_key, key_of
 from roadscan.run.session import Session, found_once
-from roadscan.store.logs import NAVIGATION, DataFile, LogRecord
+from roadscan.store.logs import NAVIGATION, DataFile, Fault, LogRecord
 from roadscan.store.store import Store
 
 UInt64 = npt.NDArray[np.uint64]
@@ -218,12 +218,12 @@ def plan_survey(
             "the survey has no readings", expected="at least one log of scans, returns or points with rows in it"
         )
     passes = tuple(_passes(survey, sources))
-    centre_lines = CentreLines.of(survey)
+    centre_lines = centre_lines_of(survey)
     tile_key = key_of(
         code_digest("roadscan.tiles.tasks.tiles:compute_tiles"),
         config.tiles.cell_m,
         config.tiles.cell_table,
-        None if centre_lines is None else centre_lines.key(),
+        centre_lines_key(centre_lines),
     )
     return SurveyPlan(survey, store, records, ground, sources, passes, centre_lines, tile_key, apart, corrections)
 

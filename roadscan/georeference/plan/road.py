@@ -94,31 +94,34 @@ class CentreLines:
     options: str
     """Settings of the layer (JSON of ``RoadLinesOptions``)."""
 
-    @classmethod
-    def of(cls, survey: Survey) -> CentreLines | None:
-        """Return what the survey file states; None where points are not limited to centre lines."""
-        stated = survey.config.filters
-        if stated.centre_line is None:
-            return None
-        path = survey.resolve(stated.centre_line)
-        if not path.is_file():
-            raise ConfigError("the centre-line layer does not exist", change="check filters.centre_line", file=path)
-        options = dict(stated.centre_line_options)
-        if stated.centre_line_width not in {BUFFER, CLASS}:
-            options["width_column"] = stated.centre_line_width
-        return cls(
-            path=path,
-            digests=tuple(file_digest(file) for file in (path, *sidecars(path))),
-            crs=stated.centre_line_crs,
-            width=stated.centre_line_width,
-            buffer_m=stated.centre_line_buffer_m,
-            margin_m=stated.centre_line_margin_m,
-            options=RoadLinesOptions.parse(options, file=path).model_dump_json(),
-        )
 
-    def key(self) -> list[object]:
-        """Key of all that changes tiles; the place of the file does not."""
-        return [RoadLines.version, self.digests, self.crs, self.width, self.buffer_m, self.margin_m, self.options]
+def centre_lines_of(survey: Survey) -> CentreLines | None:
+    """Return what the survey file states; None where points are not limited to centre lines."""
+    stated = survey.config.filters
+    if stated.centre_line is None:
+        return None
+    path = survey.resolve(stated.centre_line)
+    if not path.is_file():
+        raise ConfigError("the centre-line layer does not exist", change="check filters.centre_line", file=path)
+    options = dict(stated.centre_line_options)
+    if stated.centre_line_width not in {BUFFER, CLASS}:
+        options["width_column"] = stated.centre_line_width
+    return CentreLines(
+        path=path,
+        digests=tuple(file_digest(file) for file in (path, *sidecars(path))),
+        crs=stated.centre_line_crs,
+        width=stated.centre_line_width,
+        buffer_m=stated.centre_line_buffer_m,
+        margin_m=stated.centre_line_margin_m,
+        options=RoadLinesOptions.parse(options, file=path).model_dump_json(),
+    )
+
+
+def centre_lines_key(lines: CentreLines | None) -> list[object] | None:
+    """Return the key of all that changes tiles, None without a layer; the place of the file changes none."""
+    if lines is None:
+        return None
+    return [RoadLines.version, lines.digests, lines.crs, lines.width, lines.buffer_m, lines.margin_m, lines.options]
 
 
 @functools.lru_cache(maxsize=2)

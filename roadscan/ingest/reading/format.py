@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from roadscan.core.crs import LOCAL_WORLD, Geoid, HeightKind, MapFrame
+from roadscan.core.crs import LOCAL_WORLD, Geoid, HeightKind, MapFrame, crs_from_text, heights_of
 from roadscan.core.errors import ConfigError, CrsError, FormatError, Missing, RoadscanError, TimeSystemError, nearest
 from roadscan.core.gpstime import Clock
 from roadscan.core.plugins import found_kinds, kind_named
@@ -504,3 +504,18 @@ def format_of(path: Path) -> LogFormat:
         change='state format = "…" for this log',
         file=path,
     )
+
+
+def height_in(source: LogSource, crs: str) -> HeightKind:
+    """Return the kind of heights in a geographic or projected CRS, where the log's entry states none.
+
+    Three axes say it, two do not.
+
+    Raises
+    ------
+    ConfigError, CrsError
+        see :meth:`LogSource.need_height`.
+    """
+    if source.height is not None:
+        return source.height
+    return source.need_height(heights_of(crs_from_text(crs)).kind, f"the three axes of their CRS, {crs[:80]}")

@@ -32,31 +32,25 @@ from roadscan.core.crs import (
     crs_from_text,
     geodetic_from_world,
     grid_convergence_rad,
-    heights_of,
     world_frame_of,
 )
 from roadscan.core.errors import ConfigError, CrsError, Missing, RoadscanError
 from roadscan.core.frames import BODY_FROM_AXES, ENU_FROM_NED, body_from_axes, quaternion_from_rotation
 from roadscan.core.gpstime import Clock
-from roadscan.ingest.reading.format import Item, LogSource, Rows
-from roadscan.ingest.reading.records import EpochReader, Sieve, drop_failing
+from roadscan.ingest.reading.format import Item, LogSource, Rows, height_in
+from roadscan.ingest.reading.records import GRID_MAX_M, HEIGHT_MAX_M, HEIGHT_MIN_M, EpochReader, Sieve, drop_failing
 
 Index = Int64 | slice
 
 North = Literal["true", "grid"]
 """North from which a heading is counted."""
 
-HEIGHT_MIN_M: Final = -1_000.0  # lowest height that is no damage
-HEIGHT_MAX_M: Final = 20_000.0
-"""Greatest height that is no damage: survey vehicles are within these limits."""
 ANGLE_MAX_RAD: Final = 4 * math.pi
 """Attitude angles beyond two turns are damage."""
 SIGMA_MAX_M: Final = 1e6
 """A position with a larger σ is damage."""
 SIGMA_MAX_DEG: Final = 360.0
 """An angle with a σ above a whole turn is damage."""
-GRID_MAX_M: Final = 2.1e7
-"""Eastings and northings beyond half the Earth's girth are damage."""
 _LOCAL_M: Final = 20_000.0
 """A drive that stays so near (m) to the origin of a grid, far from where the grid is used, has local coordinates."""
 
@@ -349,21 +343,6 @@ def _geodetic_of_grid(crs: str, file: Path) -> pyproj.CRS:
             file=file,
         )
     return geographic
-
-
-def height_in(source: LogSource, crs: str) -> HeightKind:
-    """Return the kind of heights in a geographic or projected CRS, where the log's entry states none.
-
-    Three axes say it, two do not.
-
-    Raises
-    ------
-    ConfigError, CrsError
-        see :meth:`LogSource.need_height`.
-    """
-    if source.height is not None:
-        return source.height
-    return source.need_height(heights_of(crs_from_text(crs)).kind, f"the three axes of their CRS, {crs[:80]}")
 
 
 def _check_cartesian(position: Float64, sieve: Sieve) -> None:

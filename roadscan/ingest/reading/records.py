@@ -330,3 +330,18 @@ def field_named(
             file=file,
         )
     return stated
+
+
+NO_TEXT: Final = "\ufffd"
+"""Replaces bytes that could not be decoded."""
+
+
+HEIGHT_MIN_M: Final = -1_000.0  # lowest height that is no damage
+
+
+HEIGHT_MAX_M: Final = 20_000.0
+"""Greatest height that is no damage: survey vehicles are within these limits."""
+
+
+GRID_MAX_M: Final = 2.1e7
+"""Eastings and northings beyond half the Earth's girth are damage."""

@@ -21,7 +21,7 @@ from roadscan.georeference.plan.plan import (
 from roadscan.navigation.tasks.navigate import records_of
 from roadscan.navigation.tasks.recorded_pictures import TakenPictures
 from roadscan.pictures.exposures import FOLDER, FRAMES, FrameTask, camera_pictures, write_frame
-from roadscan.run.engine.bundles import run_bundles
+from roadscan.run.engine.compute import run_bundles
 from roadscan.run.keys import code_digest, key_of
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from roadscan.calibrate.kernels.surface_patches import catmull_rom, sampled
 from roadscan.compute.kernel_options import inlined, kernel
+from roadscan.compute.kernels.arrays import catmull_rom, sampled
 
 HALF_PX = 8  # Half the edge of a patch (px): 17 by 17 pixels hold enough grey values for eight unknowns.
 _UNKNOWNS = 8  # Two of the place, four of the affine form, factor and level of the grey values.

@@ -13,9 +13,9 @@ from scipy.special import erf
 
 from roadscan.compute.array_types import Float32, Float64
 from roadscan.core.extras import cv2
-from roadscan.pictures.lens import projected, straightened
+from roadscan.pictures.lens import Lens, projected, straightened
 from roadscan.pictures.settings import PictureTarget, PictureTargetsConfig, TargetStyle
-from roadscan.pictures.views import Lens, Views
+from roadscan.pictures.views import Views
 
 _FIELD: Final = 0.85
 """Part of a chequered target that is compared, in half edges: its outline belongs to what is around it."""

@@ -17,9 +17,8 @@ import pyarrow as pa
 
 from roadscan.compute.array_types import Bool, Int64
 from roadscan.pictures.exposures import Exposures
-from roadscan.pictures.lens import pixels_of, rays_of
+from roadscan.pictures.lens import Lens, pixels_of, rays_of
 from roadscan.pictures.ties.matching import Features, alike
-from roadscan.pictures.views import Lens
 
 OWN_VEHICLE: Final = "picture_own_vehicle"
 CELLS: Final = (20, 32)

@@ -21,8 +21,8 @@ from roadscan.core.extras import cv2
 from roadscan.pictures.exposures import read_picture
 from roadscan.pictures.kernels.patch_matching import match_patches
 from roadscan.pictures.lens import derivatives, rays_of
-from roadscan.pictures.ties.tracks import CHAINS, TRACKS, Chains, chains_of, places_of, rows_of
-from roadscan.pictures.ties.work import ALL, FEATURES, TieWork, written
+from roadscan.pictures.ties.tracks import ALL, CHAINS, TRACKS, Chains, chains_of, places_of, rows_of
+from roadscan.pictures.ties.work import FEATURES, TieWork, written
 from roadscan.run.keys import code_digest, key_of
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema

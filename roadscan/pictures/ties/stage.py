@@ -14,9 +14,8 @@ from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import poses_plan_of
 from roadscan.pictures.ties.own_vehicle import OWN_VEHICLE
 from roadscan.pictures.ties.refining import REFINED, refine_picture, refine_tasks, tracks_key, write_tracks
-from roadscan.pictures.ties.tracks import CHAINS, TRACKS, chains_key, write_chains
+from roadscan.pictures.ties.tracks import ALL, CHAINS, TRACKS, chains_key, write_chains
 from roadscan.pictures.ties.work import (
-    ALL,
     FEATURES,
     MATCHES,
     TieWork,
@@ -27,7 +26,7 @@ from roadscan.pictures.ties.work import (
     own_vehicle_tasks,
     plan_ties,
 )
-from roadscan.run.engine.bundles import run_bundles
+from roadscan.run.engine.compute import run_bundles
 from roadscan.run.session import Session
 from roadscan.run.stage import Stage, StageState
 from roadscan.store.logs import LogRecord

@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.pictures.lens import rays_of
-from roadscan.pictures.ties.work import ALL, FEATURES, MATCHES, MatchTask, TieWork, load_features, odd_pictures, written
+from roadscan.pictures.ties.work import FEATURES, MATCHES, MatchTask, TieWork, load_features, odd_pictures, written
 from roadscan.run.keys import code_digest, key_of
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
@@ -316,3 +316,7 @@ def chains_of(work: TieWork, manifest: Manifest, store: Store) -> Chains:
     pixel = np.stack([rows.column(name).to_numpy() for name in ("u_px", "v_px")], axis=-1)
     picture = np.array([number[one] for one in names], np.int64)
     return Chains(rows.column("track").to_numpy(), picture, pixel.astype(np.float64), rows.column("size_px").to_numpy())
+
+
+ALL: Final = "all"
+"""Unit of chains and tracks in the manifest."""

@@ -16,12 +16,11 @@ from roadscan.core.gpstime import NS_PER_S
 from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
 from roadscan.navigation.tasks.trajectories import usual_pose_sigma
 from roadscan.pictures.exposures import Camera, Exposures, exposures_of, read_picture
-from roadscan.pictures.lens import rays_of
+from roadscan.pictures.lens import Lens, rays_of
 from roadscan.pictures.settings import PictureTiesConfig
 from roadscan.pictures.ties.matching import DESCRIPTOR, Features, Relative, features_of, matches, pairs_of
 from roadscan.pictures.ties.own_vehicle import OWN_VEHICLE, cells_from, cells_of, compare, compared_pictures, detail_of
 from roadscan.pictures.ties.own_vehicle import rows_of as rows_of_cells
-from roadscan.pictures.views import Lens
 from roadscan.run.keys import code_digest, key_of
 from roadscan.store.codecs.image_files import ImageError
 from roadscan.store.digest import bytes_digest
@@ -32,8 +31,6 @@ from roadscan.store.writer import parquet_bytes
 
 FEATURES: Final = "picture_features"
 MATCHES: Final = "picture_matches"
-ALL: Final = "all"
-"""Unit of chains and tracks in the manifest."""
 
 _LEAST_TURN_DEG: Final = 0.03
 """1 σ of the turn between two neighbouring pictures, at least (degrees): that of a good attitude over a second."""

@@ -9,8 +9,7 @@ import pyarrow as pa
 
 from roadscan.adjust.tasks.outcome import FOLDER, PICTURES
 from roadscan.pictures.ties.stage import MASKS
-from roadscan.pictures.ties.tracks import TRACKS
-from roadscan.pictures.ties.work import ALL
+from roadscan.pictures.ties.tracks import ALL, TRACKS
 from roadscan.report.blocks import Block, Paragraph, Picture, Table
 from roadscan.report.section import Material, Section
 from roadscan.run.session import Session

@@ -16,7 +16,7 @@ from pyproj.database import query_crs_info
 from pyproj.enums import PJType
 from pyproj.exceptions import CRSError as ProjCrsError
 
-from roadscan.store.codecs.tiff import without_place_warning
+from roadscan.store.codecs.cog import without_place_warning
 
 DIRECTORY: Final = 34_735  # TIFF tag of the keys (OGC 19-008)
 DOUBLES: Final = 34_736  # TIFF tag of their numbers

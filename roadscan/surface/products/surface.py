@@ -16,8 +16,7 @@ from roadscan.compute.array_types import Float32
 from roadscan.core.errors import ConfigError, StoreError
 from roadscan.core.grid import Bounds, TileId
 from roadscan.core.strict import Strict
-from roadscan.store.codecs.cog import Band, Pixels, dense_image, write_cog, write_sparse_cog
-from roadscan.store.codecs.tiff import check_cog
+from roadscan.store.codecs.cog import Band, Pixels, check_cog, dense_image, write_cog, write_sparse_cog
 from roadscan.surface.tile import EMPTY, GridWindow, SurfaceTile
 from roadscan.tiles.product import LoadCells, Output, ProductContext, SurfaceProduct, SurveyProduct, TileSummary
 from roadscan.tiles.products.raster import (

@@ -35,8 +35,7 @@ from roadscan.georeference.place import Placement, ProfilePoints
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.plan.road import looks_across, road_key
 from roadscan.georeference.sources import Georeferencer, MapSettings, RawSlice, ReadingSource, geometry_of, read_rows
-from roadscan.run.engine.bundles import run_bundles
-from roadscan.run.engine.compute import Compute
+from roadscan.run.engine.compute import Compute, run_bundles
 from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import file_digest
 from roadscan.store.logs import DataFile

@@ -23,21 +23,6 @@ LIGHT_STEPS = 64.0
 """Intensities are summed in units of 1/64 of a digital number."""
 
 
-class Cells(NamedTuple):
-    """Cells of a tile with a reading, sorted by row and column."""
-
-    column: npt.NDArray[np.uint16]
-    """(n,) from the tile's west edge."""
-    row: npt.NDArray[np.uint16]
-    """(n,) from its south edge."""
-    height_m: npt.NDArray[np.float64]
-    """(n,)"""
-    intensity: npt.NDArray[np.float32]
-    """(n,) mean of the cell's readings."""
-    readings: npt.NDArray[np.uint32]
-    """(n,)"""
-
-
 class Squares(NamedTuple):
     """Columns for s squares of cells, which kernels write in order of row and column."""
 

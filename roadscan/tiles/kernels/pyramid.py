@@ -256,10 +256,25 @@ def reduce_cells(cells, base, levels, sums, pixels):
 
     Parameters
     ----------
-    cells : ``decimate.Cells``; levels : Levels; pixels : Pixels.
+    cells : Cells; levels : Levels; pixels : Pixels.
     base : float64, whole metres near the heights: sums are of heights above it.
     sums : (levels, 4, pixels along an edge of the first) float64, zeros; zeros again at the end. Cells, points, height
         above `base`, intensity of a strip's pixels.
     """
     most = levels.factors.size
     _reduce(cells, base, levels, sums, pixels, np.full(most, levels.edges[0]), np.zeros(most, np.int64))
+
+
+class Cells(NamedTuple):
+    """Cells of a tile with a reading, sorted by row and column."""
+
+    column: npt.NDArray[np.uint16]
+    """(n,) from the tile's west edge."""
+    row: npt.NDArray[np.uint16]
+    """(n,) from its south edge."""
+    height_m: npt.NDArray[np.float64]
+    """(n,)"""
+    intensity: npt.NDArray[np.float32]
+    """(n,) mean of the cell's readings."""
+    readings: npt.NDArray[np.uint32]
+    """(n,)"""

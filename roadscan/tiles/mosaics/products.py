@@ -9,8 +9,7 @@ from pathlib import Path
 from roadscan.core.grid import TileId
 from roadscan.core.strict import Strict
 from roadscan.georeference.plan.plan import SurveyPlan
-from roadscan.run.engine.bundles import run_bundles
-from roadscan.run.engine.compute import Compute
+from roadscan.run.engine.compute import Compute, run_bundles
 from roadscan.run.keys import key_of
 from roadscan.store.digest import file_digest
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded

@@ -12,8 +12,7 @@ import numpy.typing as npt
 from pydantic import Field
 
 from roadscan.core.strict import Strict
-from roadscan.store.codecs.cog import Image, sparse_image, write_cog
-from roadscan.store.codecs.tiff import check_cog
+from roadscan.store.codecs.cog import Image, check_cog, sparse_image, write_cog
 from roadscan.tiles.cells import Level, pyramid_of
 from roadscan.tiles.product import ProductContext, Tile, TileProduct
 from roadscan.tiles.products.raster import CellBox, Quantity, about, band_of

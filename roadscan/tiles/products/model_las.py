@@ -204,6 +204,7 @@ def decimate(cells: TileCells, side: int, cell_m: float) -> Squares:
     """
     from roadscan.tiles.kernels import decimate as kernels
     from roadscan.tiles.kernels.decimate_2x2 import decimate_2x2
+    from roadscan.tiles.kernels.pyramid import Cells
 
     edge = cells.cells_per_edge
     patch = patch_cells(side, edge, cell_m)
@@ -215,7 +216,7 @@ def decimate(cells: TileCells, side: int, cell_m: float) -> Squares:
     )  # fmt: skip
     some = cells.height_robust_m[:: max(len(cells) // _SAMPLE, 1)]
     base = float(np.floor(np.median(some))) if len(cells) else 0.0
-    own = kernels.Cells(
+    own = Cells(
         cells.column, cells.row, read_only(cells.height_robust_m), cells.intensity_mean, cells.count
     )  # fmt: skip
     if patch == side == 2:

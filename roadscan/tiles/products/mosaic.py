@@ -11,7 +11,7 @@ from pydantic import Field
 
 from roadscan.core.grid import TileId
 from roadscan.core.strict import Strict
-from roadscan.store.codecs.tiff import raster_settings
+from roadscan.store.codecs.cog import raster_settings
 from roadscan.tiles.product import Cells, LoadCells, Output, ProductContext, SurveyProduct, TileSummary
 from roadscan.tiles.products.raster import (
     COLUMNS,

@@ -19,8 +19,7 @@ from roadscan.core.crs import MapFrame, crs_from_text
 from roadscan.core.errors import StoreError
 from roadscan.core.gpstime import utc_from_gps_ns
 from roadscan.core.grid import QUANTA_PER_M, TileGrid, TileId
-from roadscan.store.codecs.cog import BLOCK, About, Band, overview_factors, write_sparse_cog
-from roadscan.store.codecs.tiff import check_cog
+from roadscan.store.codecs.cog import BLOCK, About, Band, check_cog, overview_factors, write_sparse_cog
 from roadscan.tiles.cells import CellValues, TileCells
 from roadscan.tiles.product import LoadCells, Output, ProductContext, TileSummary
 

@@ -32,9 +32,8 @@ from roadscan.store.schema import table_schema
 from roadscan.tiles.accumulator import Accumulator, PoolExhaustedError
 from roadscan.tiles.accumulator import Pool as TilePool
 from roadscan.tiles.cells import TileCells, TileEvidence
-from roadscan.tiles.kernels.accumulate import CountingWork, Pool
+from roadscan.tiles.kernels.accumulate import CountingWork, Pool, accumulate_profiles
 from roadscan.tiles.kernels.bucket_statistics import bucket_mirror, bucket_returns
-from roadscan.tiles.kernels.profile_counting import accumulate_profiles
 from roadscan.tiles.kernels.row_buckets import ActiveTiles, Buckets, Measured
 from roadscan.tiles.tasks.tile_plan import TileTask
 

@@ -5,23 +5,21 @@ from __future__ import annotations
 import hashlib
 from array import array
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
 
-from roadscan.compute.arrays import scatter_about
-from roadscan.core.grid import QUANTUM_M, LanePass, TileGrid, TileId
+from roadscan.core.grid import TileId
 from roadscan.core.witness import Finding, Witness
 from roadscan.footprints.footprints import PRODUCT as FOOTPRINTS
-from roadscan.georeference.cloud import TilePoints
 from roadscan.georeference.reading_counts import LogCounts
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.records import figures_in
 from roadscan.tiles.product import TileSummary
-from roadscan.tiles.tasks.tile_plan import TILE
+from roadscan.tiles.tasks.tile_plan import APART_FIGURE, TILE
 
 PASSES_APART: Final = Witness(
     "passes_apart",
@@ -34,46 +32,10 @@ PASSES_APART: Final = Witness(
     told=("findings",),
 )
 
-APART_FIGURE: Final = "passes_apart"
-"""Name of the figure in a tile's record."""
-_MOST_PASSES: Final = 6
-"""Most passes of a tile that are compared, those with the most points."""
-_LEAST_CELLS: Final = 20  # Least number of cells that both passes saw.
 _LEAST_M: Final = 0.02
 """Least reported difference: passes of a good mapping system in one datum agree better."""
 _SCATTERS: Final = 5.0  # A reported difference exceeds the scatter this many times.
 _MOST_TOLD: Final = 8  # Most differences that are reported.
-
-
-def apart_in_tile(points: TilePoints, grid: TileGrid, passes: Sequence[LanePass]) -> list[list[Any]]:
-    """Return for each two passes of a tile: both in words, number of common cells, median difference of their mean
-    heights (m) and its scatter (m, 1 σ of a cell).
-    """
-    ids, counts = np.unique(points.pass_id, return_counts=True)
-    if ids.size < 2:
-        return []
-    ids = np.sort(ids[np.argsort(-counts, kind="stable")[:_MOST_PASSES]])
-    across = int(points.x_quanta.max()) // grid.cell_quanta + 1
-    cell = points.y_quanta.astype(np.int64) // grid.cell_quanta * across + points.x_quanta // grid.cell_quanta
-    size = int(cell.max()) + 1
-    datum = int(points.height_quanta[0])
-    means = np.full((ids.size, size), np.nan)
-    for k, one in enumerate(ids.tolist()):
-        own = points.pass_id == one
-        count = np.bincount(cell[own], minlength=size)
-        total = np.bincount(cell[own], (points.height_quanta[own] - datum).astype(np.float64), minlength=size)
-        means[k, count > 0] = total[count > 0] / count[count > 0] * QUANTUM_M
-    words = {int(p.pass_id): f"run '{p.run}' (pass {p.pass_id})" for p in passes}
-    found: list[list[Any]] = []
-    for a, b in zip(*np.triu_indices(ids.size, 1), strict=True):
-        off = means[b] - means[a]
-        off = off[np.isfinite(off)]
-        if off.size >= _LEAST_CELLS:
-            middle = float(np.median(off))
-            scatter = scatter_about(off, middle)
-            names = [words.get(int(ids[k]), f"pass {ids[k]}") for k in (a, b)]
-            found.append([*names, int(off.size), round(middle, 6), round(scatter, 6)])
-    return found
 
 
 def apart_findings(told: Iterable[tuple[str, str, int, float, float]]) -> list[Finding]:

@@ -10,7 +10,7 @@ import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -422,3 +422,7 @@ class TilePlan:
 def tiles_of(session: Session) -> PlannedTiles:
     """Return the tiles that a reading may touch, with their keys."""
     return plan_tiles(footprints_of(session), plan_of(session))
+
+
+APART_FIGURE: Final = "passes_apart"
+"""Name of the figure in a tile's record."""

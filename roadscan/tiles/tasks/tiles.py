@@ -7,12 +7,14 @@ import json
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Final, Protocol, TypeVar
 
 import numpy as np
 
+from roadscan.compute.arrays import scatter_about
 from roadscan.core.gpstime import utc_from_gps_ns
-from roadscan.core.grid import TileId
+from roadscan.core.grid import QUANTUM_M, LanePass, TileGrid, TileId
+from roadscan.georeference.cloud import TilePoints
 from roadscan.georeference.reading_counts import ReadingCounts
 from roadscan.run.engine.compute import Compute, reason_of
 from roadscan.store.manifest import Manifest
@@ -20,8 +22,7 @@ from roadscan.store.records import OutputRecord, Packed, Row, table_of
 from roadscan.store.store import told_if_full
 from roadscan.tiles.cells import TileCells, TileEvidence, write_cells, write_overviews
 from roadscan.tiles.product import Tile, publish_file, write_product
-from roadscan.tiles.tasks.tile_figures import APART_FIGURE, apart_in_tile
-from roadscan.tiles.tasks.tile_plan import OVERVIEWS, TILE, Block, TileTask
+from roadscan.tiles.tasks.tile_plan import APART_FIGURE, OVERVIEWS, TILE, Block, TileTask
 from roadscan.tiles.tasks.tile_points import load_tiles
 
 
@@ -208,3 +209,41 @@ def _with_fates(record: OutputRecord, fates: ReadingCounts) -> OutputRecord:
     if not told:
         return record
     return record._replace(detail=json.dumps({**record.figures(), "fates": told}))
+
+
+_MOST_PASSES: Final = 6
+"""Most passes of a tile that are compared, those with the most points."""
+
+
+_LEAST_CELLS: Final = 20  # Least number of cells that both passes saw.
+
+
+def apart_in_tile(points: TilePoints, grid: TileGrid, passes: Sequence[LanePass]) -> list[list[Any]]:
+    """Return for each two passes of a tile: both in words, number of common cells, median difference of their mean
+    heights (m) and its scatter (m, 1 σ of a cell).
+    """
+    ids, counts = np.unique(points.pass_id, return_counts=True)
+    if ids.size < 2:
+        return []
+    ids = np.sort(ids[np.argsort(-counts, kind="stable")[:_MOST_PASSES]])
+    across = int(points.x_quanta.max()) // grid.cell_quanta + 1
+    cell = points.y_quanta.astype(np.int64) // grid.cell_quanta * across + points.x_quanta // grid.cell_quanta
+    size = int(cell.max()) + 1
+    datum = int(points.height_quanta[0])
+    means = np.full((ids.size, size), np.nan)
+    for k, one in enumerate(ids.tolist()):
+        own = points.pass_id == one
+        count = np.bincount(cell[own], minlength=size)
+        total = np.bincount(cell[own], (points.height_quanta[own] - datum).astype(np.float64), minlength=size)
+        means[k, count > 0] = total[count > 0] / count[count > 0] * QUANTUM_M
+    words = {int(p.pass_id): f"run '{p.run}' (pass {p.pass_id})" for p in passes}
+    found: list[list[Any]] = []
+    for a, b in zip(*np.triu_indices(ids.size, 1), strict=True):
+        off = means[b] - means[a]
+        off = off[np.isfinite(off)]
+        if off.size >= _LEAST_CELLS:
+            middle = float(np.median(off))
+            scatter = scatter_about(off, middle)
+            names = [words.get(int(ids[k]), f"pass {ids[k]}") for k in (a, b)]
+            found.append([*names, int(off.size), round(middle, 6), round(scatter, 6)])
+    return found

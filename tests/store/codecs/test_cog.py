@@ -16,13 +16,13 @@ from roadscan.core.errors import StoreError
 from roadscan.store.codecs.cog import (
     About,
     Band,
+    check_cog,
     dense_image,
     overview_factors,
     sparse_image,
     write_cog,
     write_sparse_cog,
 )
-from roadscan.store.codecs.tiff import check_cog
 
 RNG = np.random.default_rng(5)
 PLACE = Affine(0.5, 0.0, 691_000.0, 0.0, -0.5, 5_335_000.0)

@@ -17,9 +17,8 @@ from rasterio.enums import Resampling
 
 from roadscan.core.errors import StoreError
 from roadscan.core.grid import TileId
-from roadscan.store.codecs import tiff as tiff_module
-from roadscan.store.codecs.cog import overview_factors
-from roadscan.store.codecs.tiff import raster_crs
+from roadscan.store.codecs import cog
+from roadscan.store.codecs.cog import overview_factors, raster_crs
 from roadscan.tiles.product import Tile, product_named
 from roadscan.tiles.products.geotiff import GeoTiff, GeoTiffOptions
 from roadscan.tiles.products.raster import CellBox
@@ -183,7 +182,7 @@ def test_blocks_without_cells_are_left_out(geotiff, workshop, places, tmp_path):
 
 
 def test_files_beyond_4_gb_are_big_tiff(geotiff, workshop, places, tmp_path, monkeypatch):
-    monkeypatch.setattr(tiff_module, "_CLASSIC_END", 0)
+    monkeypatch.setattr(cog, "_CLASSIC_END", 0)
     cells = write(geotiff, workshop, places["utm_north"], tmp_path / "tile", cell_m=0.1).cells
     assert (tmp_path / "tile").read_bytes()[:4] == b"II\x2b\x00"
     geotiff.check(tmp_path / "tile")

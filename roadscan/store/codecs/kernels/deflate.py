@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from roadscan.compute.kernel_options import bare, bare_inlined, kernel
-from roadscan.store.codecs.kernels.bit_words import appended
+from roadscan.compute.kernel_options import bare, bare_inlined, inlined, kernel
 
 SEGMENT = 16  # bytes that are examined together
 _SHORTEST_GAP = 4
@@ -282,3 +281,16 @@ def deflate(data: Any, words: Any, segments: Any, pairs: Any, out: Any) -> bytes
     bits = _pack(data, words, literals, entries, _DISTANCE, pairs, out)
     stream: bytes = out.view(np.uint8)[: (bits + 7) // 8].tobytes()
     return stream + (int(high) % ADLER << 16 | int(low) % ADLER).to_bytes(4, "big")
+
+
+@inlined
+def appended(word, used, bits, count):
+    """Append `count` bits to the `used` bits of a word; return (first word, current word, its bits, 1 if it is new).
+
+    A new word follows where the old one is full.
+    """
+    now = word | (bits << used)
+    total = used + count
+    full = total >> _U(6)
+    following = (bits >> _U(1)) >> (_U(63) - used)
+    return now, following if full else now, total & _U(63), full

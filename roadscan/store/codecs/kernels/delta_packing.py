@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from roadscan.compute.kernel_options import inlined, inner, kernel
-from roadscan.store.codecs.kernels.bit_words import appended
+from roadscan.store.codecs.kernels.deflate import appended
 from roadscan.store.codecs.kernels.wide_unpacking import NOT_KNOWN, READ_AHEAD_BYTES, unpack_blocks
 
 BLOCK = 128  # values of a block

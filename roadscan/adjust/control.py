@@ -175,13 +175,9 @@ def sight(
         height = seen.height if np.isfinite(point.height_m) else HeightFind(nan, nan, nan, nan, seen.count, 0.0, "")
         at = np.array([point.easting_m, point.northing_m]) if seen.status != "found" else seen.place_m
         found = _with_pose(
-            point,
-            heads,
-            at,
-            height,
-            settings.height_radius_m,
+            point, heads, at, height, settings.height_radius_m,
             (seen.status, seen.why_not, seen.place_m, seen.covariance_m2, None),
-        )
+        )  # fmt: skip
         return replace(found, contrast=seen.contrast)
     if picked is not None:
         status, place = "picked", np.array([picked.easting_m, picked.northing_m])

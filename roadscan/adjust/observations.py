@@ -60,6 +60,9 @@ MOUNTED: Final = ("forward_m", "right_m", "down_m", "roll_rad", "pitch_rad", "he
 """The unknowns of a mounting: lever arm and a turn that follows the boresight, both along the axes of the body, and the
 share by which ranges are longer."""
 
+TURNS: Final = {name: MOUNTED.index(name) for name in COMPONENTS[3:]}
+"""Components of a pose that a turn of a mounting looks like, and the number of that turn in `MOUNTED`."""
+
 CAMERA: Final = COLUMNS
 """The unknowns of a camera beside its mounting: its lens (OpenCV's parameters), what is added to the stamps of its
 pictures, and to the time between the exposures of two rows."""

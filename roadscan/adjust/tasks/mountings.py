@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from roadscan.adjust.adjustment import MountingErrors
 from roadscan.adjust.control_test import APART
-from roadscan.adjust.observations import CAMERA, MOUNTED, MountingPrior
+from roadscan.adjust.observations import CAMERA, MOUNTED, TURNS, MountingPrior
 from roadscan.adjust.settings import AdjustConfig, CameraPriors
 from roadscan.adjust.tasks.near import Sources
 from roadscan.adjust.unknowns import sharing
@@ -68,7 +68,6 @@ _NAMES: Final = (
     "lever arm forward", "lever arm to the right", "lever arm down",
     "boresight roll", "boresight pitch", "boresight heading", "range scale",
 )  # fmt: skip
-_FIRST_TURN, _LAST_TURN = MOUNTED.index("roll_rad"), MOUNTED.index("heading_rad")
 DOUBTED: Final = 3.0
 """A mounting that is off by more than this many stated σ is reported."""
 CHANCE: Final = 0.0027
@@ -379,7 +378,7 @@ def mounting_findings(found: MountingErrors | None) -> list[Finding]:
                      f"stated σ {_told(prior[c], c)})" for c in off.tolist()]  # fmt: skip
             like = (
                 " (attitudes of all poses that are turned by as much look the same)"
-                if ((off >= _FIRST_TURN) & (off <= _LAST_TURN)).any()
+                if np.isin(off, list(TURNS.values())).any()
                 else ""
             )
             said.append(

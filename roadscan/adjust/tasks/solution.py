@@ -27,6 +27,7 @@ from roadscan.adjust.helmert import RigidFit, rigid_fit
 from roadscan.adjust.observations import (
     FIXED,
     MOUNTED,
+    TURNS,
     CameraPrior,
     GaussMarkov,
     MountingPrior,
@@ -75,8 +76,6 @@ from roadscan.poses.trajectory import Corrections
 
 _WIDENED: Final = 3
 """Adjustments, at most, until no mounting is off by more than its σ allows."""
-_TURNS: Final = {"roll_rad": 3, "pitch_rad": 4, "heading_rad": 5}
-"""Components of poses by the number of the turn of a mounting that looks like them."""
 _MUCH_TOO_SMALL: Final = 4.0
 """Variance factor of attitudes from which on a turn of the sensors is asked instead: σ is half of what it should be."""
 _WIDE_RAD: Final = float(np.radians(5.0))
@@ -378,7 +377,7 @@ def turned_for_good(
     σ are all too small. The first is asked first, as it is the simpler one. Variance components alone never find it:
     they widen the process of the poses until this takes up the turn.
     """
-    wide = [axis for name, axis in _TURNS.items() if found.variance_factors[name] > _MUCH_TOO_SMALL]
+    wide = [axis for name, axis in TURNS.items() if found.variance_factors[name] > _MUCH_TOO_SMALL]
     asked = np.isin(np.arange(len(MOUNTED)), wide)
     free = tuple(
         one if is_camera else replace(one, sigma=np.where(asked & (one.sigma > 0.0), _WIDE_RAD, one.sigma))
@@ -387,7 +386,7 @@ def turned_for_good(
     if not any((one.sigma < other.sigma).any() for one, other in zip(priors, free, strict=True)):
         return None
     turned = adjust(observations, poses, settings, free, cameras)
-    if any(turned.variance_factors[name] > 1.0 for name, axis in _TURNS.items() if axis in wide):
+    if any(turned.variance_factors[name] > 1.0 for name, axis in TURNS.items() if axis in wide):
         return None
     return tuple(
         replace(one, sigma=np.where(one.sigma < other.sigma, np.maximum(np.abs(error), one.sigma), one.sigma))

@@ -37,6 +37,7 @@ from roadscan.adjust.sparse_normal import Rows
 from roadscan.adjust.unknowns import HEIGHT_ALONE, ControlPoints, FixedRun, Unknowns, directions_of, fixed_runs
 from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.pictures.lens import PARAMETERS
+from roadscan.poses.movement import MountingChange
 from roadscan.poses.trajectory import Corrections
 
 _DOWN: Final = COMPONENTS.index("down_m")
@@ -99,6 +100,12 @@ class MountingErrors:
     """(s, 7) 1 σ of the corrected mounting; that of the prior where no observation determines it."""
     covariance: Float64
     """(7 s, 7 s) of the errors of all sensors, without the height error common to all."""
+
+    @property
+    def changes(self) -> dict[tuple[str, str], MountingChange]:
+        """Returns the corrections that are not 0, as changes of mountings."""
+        every = zip(self.sensors, self.error, strict=True)
+        return {sensor: MountingChange.of(error) for sensor, error in every if error.any()}
 
     def of(self, which: Bool) -> MountingErrors:
         """Returns the errors of some sensors (s,)."""

@@ -94,6 +94,14 @@ class Seat:
     beam_body: Float64
     """(3,) or (n, 3) direction of its beams where all are parallel; NaN where they fan out from its origin."""
 
+    @classmethod
+    def of(cls, mountings: Mountings, epochs_gps_ns: Int64, *, parallel: bool) -> Self:
+        """Return the seats (n, 3) at epochs (n,) of a sensor whose beams are all parallel, or fan out."""
+        levers = np.array([one.lever_arm_body_m for one in mountings.mountings])
+        beams = np.array([np.array(one.body_from_sensor)[:, 2] for one in mountings.mountings])
+        at = np.searchsorted(np.array(mountings.since_gps_ns[1:], np.int64), epochs_gps_ns, side="right")
+        return cls(levers[at], (beams if parallel else np.full(beams.shape, np.nan))[at])
+
     def by_scale(self, arm_body_m: Float64) -> Float64:
         """Return the movement (n, 3), body axes, of points at arms (n, 3) from the body's origin for scale 1."""
         beam = np.broadcast_to(self.beam_body, arm_body_m.shape)
@@ -129,6 +137,11 @@ class MountingChange:
     def values(self) -> Float64:
         """Return (7,) numbers: lever arm (m), turn (rad), scale."""
         return np.array([*self.lever_arm_body_m, *self.turn_rad, self.range_scale])
+
+    def rounded(self, steps: tuple[float, float, float]) -> Self:
+        """Return the change in whole steps of the lever arm (m), of the turn (rad) and of the scale."""
+        every = np.repeat(steps, (3, 3, 1))
+        return self.of(every * np.round(self.values / every))
 
     @property
     def largest(self) -> tuple[float, float]:

@@ -103,8 +103,17 @@ def street(roll_deg: float, back_deg: float, sides: tuple[int, ...]) -> tuple[di
         "easting_m": along * math.sin(heading) + across * math.cos(heading),
         "northing_m": along * math.cos(heading) - across * math.sin(heading),
         "direction_north": -flat * points_right * math.sin(heading), "direction_down": down,
-        "first_by_right": flat * points_right,
+        "first_by_right": flat * points_right, "height_m": 93.0 + rng.uniform(-1.0, 4.0, n),
     }  # fmt: skip
+    for number in range(12):
+        level = {
+            "place": number,
+            "height_m": 90.0,
+            "direction_down": -1.0,
+            "direction_north": 0.0,
+            "first_by_right": 0.0,
+        }
+        columns = {name: np.append(values, level.get(name, values[0])) for name, values in columns.items()}
     track = Track(
         0, "lidar", seconds * 1_000_000_000, seconds * 5.0 * math.sin(heading), seconds * 5.0 * math.cos(heading),
         np.zeros(61), np.full(61, heading), 20.0, 20.0, 20.0,
@@ -129,6 +138,13 @@ def test_walls_that_stand_back_are_no_roll() -> None:
     for roll_deg, back_deg, sides in ((0.0, 3.0, (-1, 1)), (0.2, 0.0, (-1, 1)), (0.0, 0.7, (1,))):
         columns, track = street(roll_deg, back_deg, sides)
         assert lean_findings(leans(columns, [track], ["drive"]), ["drive"]) == []
+
+
+def test_barriers_and_cars_are_no_walls() -> None:
+    columns, track = street(0.0, 4.2, (1,))
+    low = {**columns, "height_m": np.where(columns["direction_down"] > -1.0, 90.9, columns["height_m"])}
+    assert lean_findings(leans(columns, [track], ["drive"]), ["drive"])  # such walls would be told …
+    assert leans(low, [track], ["drive"]) == []  # … a barrier as low as this is not
 
 
 def test_few_walls_tell_nothing() -> None:

@@ -6,7 +6,7 @@ import csv
 import math
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,13 +14,13 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
-from roadscan.adjust.control import ControlPoint, PickedPlace, Sighting, WrongPoint, passes_by, sight_shifted
+from roadscan.adjust.control import ControlPoint, PickedPlace, Sighting, WrongPoint, moved_m, passes_by, sight_shifted
 from roadscan.adjust.observations import RunPrior
 from roadscan.adjust.patches import Shift, shifted
 from roadscan.adjust.places import Track, Traverse
 from roadscan.adjust.settings import AdjustConfig, LineUse, TargetConfig, TargetSettings
 from roadscan.adjust.targets.shapes import Chequered, Disc, Shape, SurveyedLine
-from roadscan.adjust.tasks.near import Circle, NearFile, NearReader, Sources, near_files
+from roadscan.adjust.tasks.near import Circle, NearFile, NearReader, Remounted, Sources, near_files, remounted_of
 from roadscan.adjust.tasks.tracks import runs_of
 from roadscan.compute.arrays import way_along
 from roadscan.core.errors import ConfigError
@@ -30,7 +30,8 @@ from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.plan.road import road_key
-from roadscan.georeference.sources import MapSettings
+from roadscan.georeference.sources import MapSettings, MountingChanges
+from roadscan.poses.movement import Seat
 from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
@@ -157,6 +158,8 @@ class ControlTask:
     """Round whose solution places the readings; 0: the recorded poses do."""
     shifts_m: tuple[Shift, ...] = ()
     """Shift of each pass by that solution; none in round 0."""
+    changes: MountingChanges = field(default_factory=dict)
+    """Changes of mountings with which that solution places readings; none in round 0."""
 
     @property
     def unit(self) -> str:
@@ -290,13 +293,14 @@ def sighting_tasks(
     priors: Sequence[RunPrior],
     seen: Sequence[tuple[ControlPoint, Sequence[tuple[Traverse, ...]]]],
     picked: Mapping[tuple[str, str], PickedPlace],
-    again: tuple[int, Sequence[tuple[Shift, ...]]] = (0, ()),
+    again: tuple[int, Sequence[tuple[Shift, ...]], MountingChanges] | None = None,
 ) -> list[ControlTask]:
     """Returns a task for each point that the traverses of one or more passes saw.
 
-    again : round, and shifts of each point's passes; none where the recorded poses place the readings.
+    again : round, shifts of each point's passes, and changes of mountings; none where the recorded poses and the stated
+    mountings place the readings.
     """
-    runs, settings, (number, shifts) = runs_of(plan), _settings(plan), again
+    runs, settings, (number, shifts, changes) = runs_of(plan), _settings(plan), again or (0, (), {})
     code = code_digest(f"{__name__}:sight_control")
     shaping = [code, settings.model_dump(mode="json"), plan.ground.max_gap_s, runs]
     tasks: list[ControlTask] = []
@@ -307,13 +311,15 @@ def sighting_tasks(
         own = tuple(picked.get((runs[p[0].run], point.name)) for p in passes)
         sigma = tuple(_sigma_pose_m(priors[p[0].run], p[0]) for p in passes)
         read = [one.key(road_key(one.source)) for one in files]
+        changed = {sensor: one.change.values.tolist() for sensor, one in remounted_of(files, changes).items()}
         key = key_of(
             shaping, asdict(point), [[asdict(t) for t in p] for p in passes], [str(o) for o in own], sigma, read,
-            *([number, moved] if number else []),
+            *([number, moved, *sorted(changed.items())] if number else []),
         )  # fmt: skip
         tasks.append(
             ControlTask(
-                plan.store, plan.ground, settings, runs, sigma, point, tuple(passes), own, files, key, number, moved
+                plan.store, plan.ground, settings, runs, sigma, point, tuple(passes), own, files, key, number, moved,
+                changes,
             )
         )  # fmt: skip
     return tasks
@@ -349,7 +355,8 @@ def passes_of(plan: SurveyPlan, tracks: Sequence[Track], point: ControlPoint) ->
 
 def sight_control(task: ControlTask) -> OutputRecord:
     """Determine what each pass saw of a point and write it (runs on a worker)."""
-    reader = NearReader(task.store, task.ground, task.files, task.runs)
+    reader = NearReader(task.store, task.ground, [one.remounted(task.changes) for one in task.files], task.runs)
+    remounted = remounted_of(task.files, task.changes)
     found = []
     moved = task.shifts_m or ((0.0, 0.0, 0.0),) * len(task.passes)
     for own, picked, sigma_pose_m, shift in zip(task.passes, task.picked, task.sigma_pose_m, moved, strict=True):
@@ -358,13 +365,28 @@ def sight_control(task: ControlTask) -> OutputRecord:
         heads = [shifted(reader.of(traverse, circle), np.array(shift)) for traverse in own]
         # Profiles are dense and returns sparse: of a pass with both, the profiles are used.
         dense = [h for h in heads if not h.returns and h.pose.size] or heads
-        found.append(sight_shifted(task.point, dense, task.settings, sigma_pose_m, picked, np.array(shift)))
+        one = sight_shifted(task.point, dense, task.settings, sigma_pose_m, picked, np.array(shift))
+        found.append(_as_stated(one, remounted.get((task.runs[one.run], one.sensor))))
     schema = table_schema(SIGHTINGS)
     rows = pa.Table.from_pylist([_row(one, task.runs, task.round) for one in found], schema=schema.arrow())
     content = parquet_bytes(rows, schema)
     target = f"{schema.location}/{task.unit}.parquet"
     task.store.write_bytes(target, content, lasting=False)
     return OutputRecord(SIGHTINGS, task.unit, task.key, target, len(content), bytes_digest(content))
+
+
+def _as_stated(one: Sighting, sensor: Remounted | None) -> Sighting:
+    """Returns a sighting that a changed mounting placed, moved to where the stated one puts it.
+
+    A lidar sees a place from before and from behind. With a mounting that is off, its readings there lie at several
+    heights, and which of them carry the mean says nothing of the road. So they are chosen with the changed mounting,
+    and what they say is moved in the mean.
+    """
+    if sensor is None or one.status == "unseen":
+        return one
+    seats = sensor.seat(np.array([one.epoch_gps_ns], np.int64))
+    east, north, up = moved_m(one, None, (sensor.change, Seat(seats.lever_body_m[0], seats.beam_body[0]))).tolist()
+    return replace(one, easting_m=one.easting_m - east, northing_m=one.northing_m - north, height_m=one.height_m - up)
 
 
 def _row(one: Sighting, runs: Sequence[str], number: int) -> dict[str, Any]:

@@ -124,13 +124,7 @@ class Mounted:
 
     def seats(self, run: str, sensor: str, epochs_gps_ns: Int64) -> Seat:
         """Returns stated lever arms and directions of the beams (n, 3) at epochs."""
-        own = self.stated[run, sensor]
-        levers = np.array([one.lever_arm_body_m for one in own.mountings])
-        beams = np.array([np.array(one.body_from_sensor)[:, 2] for one in own.mountings])
-        if (run, sensor) not in self.parallel:
-            beams = np.full(beams.shape, np.nan)
-        at = np.searchsorted(np.array(own.since_gps_ns[1:], np.int64), epochs_gps_ns, side="right")
-        return Seat(levers[at], beams[at])
+        return Seat.of(self.stated[run, sensor], epochs_gps_ns, parallel=(run, sensor) in self.parallel)
 
     def seat(self, run: str, sensor: str, epoch_gps_ns: int) -> Seat:
         """Returns the same at one epoch, (3,)."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Final, TypeAlias
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -15,18 +15,20 @@ from roadscan.adjust.patches import PassReadings
 from roadscan.adjust.places import Traverse
 from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.grid import QUANTA_PER_M
-from roadscan.core.rig import ScanGeometry
+from roadscan.core.rig import Mountings, ScanGeometry
 from roadscan.georeference.place import EIGHT_TO_SIXTEEN_BITS, EVERYWHERE, Placement
 from roadscan.georeference.sources import (
     READING_COLUMNS,
     Georeferencer,
     MapSettings,
+    MountingChanges,
     RawSlice,
     ReadingSource,
+    change_of,
     geometry_of,
     read_rows,
 )
-from roadscan.poses.movement import LevelPoses, level_poses
+from roadscan.poses.movement import LevelPoses, MountingChange, Seat, level_poses
 from roadscan.store.logs import DataFile
 from roadscan.store.store import Store
 
@@ -84,6 +86,11 @@ class NearFile:
         """Returns the same for georeferencing."""
         return RawSlice(self.source, self.path, self.groups, self.spans, self.bytes)
 
+    def remounted(self, changes: MountingChanges) -> NearFile:
+        """Returns the same, whose readings are placed with the changed mounting of their sensor, if it has one."""
+        source = replace(self.source, mounting_change=change_of(changes, self.source.run, self.source.sensor))
+        return replace(self, source=replace(source, mountings=source.adjusted_mountings))
+
     def key(self, road: Sequence[object]) -> list[object]:
         """Returns a key of all that affects readings near a place; `road` : how the road is classified."""
         return [self.source.key, *road, self.digest, list(self.groups)]
@@ -102,6 +109,29 @@ def near_files(sources: Sources, traverses: Iterable[Traverse], runs: Sequence[s
         if file.group_spans
     ]
     return [one for one in found if one is not None]
+
+
+class Remounted(NamedTuple):
+    """A sensor whose readings a changed mounting places, and what is stated of it."""
+
+    change: MountingChange
+    stated: Mountings
+    parallel: bool
+    """Whether its beams are."""
+
+    def seat(self, epochs_gps_ns: Int64) -> Seat:
+        """Returns the stated seats (n, 3) at epochs (n,)."""
+        return Seat.of(self.stated, epochs_gps_ns, parallel=self.parallel)
+
+
+def remounted_of(files: Sequence[NearFile], changes: MountingChanges) -> dict[tuple[str, str], Remounted]:
+    """Returns the sensors of files, by run and name, whose mounting changed."""
+    found = dict[tuple[str, str], Remounted]()
+    for source in (one.source for one in files):
+        change = change_of(changes, source.run, source.sensor)
+        if change is not None:
+            found[source.run, source.sensor] = Remounted(change, source.mountings, source.has_parallel_beams)
+    return found
 
 
 @dataclass(frozen=True)

@@ -74,8 +74,9 @@ from roadscan.navigation.tasks.trajectories import TrajectorySource, load_record
 from roadscan.poses.movement import NO_SEAT, level_poses
 from roadscan.poses.trajectory import Corrections
 
-_WIDENED: Final = 3
-"""Adjustments, at most, until no mounting is off by more than its σ allows."""
+_CHANGED: Final = 6
+"""Changes of the σ of mountings, at most, until nothing contradicts them: a turn, axes in which control is doubted, and
+components that are off, each of which may show the next."""
 _MUCH_TOO_SMALL: Final = 4.0
 """Variance factor of attitudes from which on a turn of the sensors is asked instead: σ is half of what it should be."""
 _WIDE_RAD: Final = float(np.radians(5.0))
@@ -325,24 +326,14 @@ def _adjusted(
         joined = Observations.joined([joined, *more, approach.rows.observations])
         cameras = list(evidence.pictures.cameras)
     filmed = np.array([one.sensor in evidence.mounted.cameras for one in priors], bool)
-    for _ in range(_WIDENED):
+    found = adjust(joined, evidence.priors, settings, priors, cameras)
+    for _ in range(_CHANGED):
+        changed = turned_for_good(joined, evidence.priors, settings, priors, cameras, found, filmed)
+        changed = _better_stated(priors, found, filmed) if changed is None else changed
+        if changed is None:
+            break
+        priors = changed
         found = adjust(joined, evidence.priors, settings, priors, cameras)
-        shared = [axis for name in found.verdict.doubted for axis in _AXES[name]]
-        # Where a camera stands beside the others is no error that all sensors have in common.
-        own = zip(priors, filmed.tolist(), strict=True)
-        kept = tuple(one if is_camera else replace(one, sigma=_without(one.sigma, shared)) for one, is_camera in own)
-        if any((one.sigma != other.sigma).any() for one, other in zip(priors, kept, strict=True)):
-            priors = kept
-            continue
-        off = disproved(found.mountings) & ~filmed[:, None]
-        if not off.any():
-            turned = turned_for_good(joined, evidence.priors, settings, priors, cameras, found, filmed)
-            if turned is None:
-                break
-            priors = turned
-            continue
-        sigma = np.where(off, np.abs(found.mountings.error), found.mountings.prior_sigma)
-        priors = tuple(replace(one, sigma=own) for one, own in zip(priors, sigma, strict=True))
     stated = np.array([one.sigma for one in evidence.mounted.priors]).reshape(-1, len(MOUNTED))
     estimated, wrong = found.mountings, filmed.copy()  # pictures show a mounting whether or not it contradicts
     wrong[~filmed] = contradicted(found.mountings.of(~filmed))
@@ -359,6 +350,23 @@ def _adjusted(
             sigma=np.where(wrong[:, None], found.mountings.sigma, estimated.sigma),
         )
     return replace(found, mountings=replace(estimated, prior_sigma=stated)), first, named, approach
+
+
+def _better_stated(
+    priors: Sequence[MountingPrior], found: Adjustment, filmed: Bool
+) -> tuple[MountingPrior, ...] | None:
+    """Returns priors of mountings that the adjustment does not contradict; None where it contradicts none."""
+    shared = [axis for name in found.verdict.doubted for axis in _AXES[name]]
+    # Where a camera stands beside the others is no error that all sensors have in common.
+    own = zip(priors, filmed.tolist(), strict=True)
+    kept = tuple(one if is_camera else replace(one, sigma=_without(one.sigma, shared)) for one, is_camera in own)
+    if any((one.sigma != other.sigma).any() for one, other in zip(priors, kept, strict=True)):
+        return kept
+    off = disproved(found.mountings) & ~filmed[:, None]
+    if not off.any():
+        return None
+    sigma = np.where(off, np.abs(found.mountings.error), found.mountings.prior_sigma)
+    return tuple(replace(one, sigma=own) for one, own in zip(priors, sigma, strict=True))
 
 
 def turned_for_good(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence, Set
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -17,14 +17,14 @@ from roadscan.adjust.patches import PassReadings, Shift, shifted
 from roadscan.adjust.places import Place, Traverse
 from roadscan.adjust.settings import TieSettings
 from roadscan.adjust.tasks.mountings import CHANCE, DETERMINED, Mounted
-from roadscan.adjust.tasks.near import Circle, NearFile, NearReader, Sources, near_files
+from roadscan.adjust.tasks.near import Circle, NearFile, NearReader, Sources, near_files, remounted_of
 from roadscan.adjust.ties.at_place import Ties, ties_at
 from roadscan.adjust.ties.tie import HEIGHT, LASERS, SAME_PASS
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.plan.road import road_key
-from roadscan.georeference.sources import MapSettings
+from roadscan.georeference.sources import MapSettings, MountingChanges
 from roadscan.poses.movement import Seat
 from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import bytes_digest
@@ -73,6 +73,8 @@ class TieTask:
     """Round whose solution places the readings; 0: the recorded poses do."""
     shifts_m: tuple[tuple[Shift, ...], ...] = ()
     """Shift of each place's traverses by that solution; none in round 0."""
+    changes: MountingChanges = field(default_factory=dict)
+    """Changes of mountings with which that solution places readings; none in round 0."""
 
     @property
     def unit(self) -> str:
@@ -92,32 +94,37 @@ def tie_tasks(
     places: Sequence[Place],
     runs: tuple[str, ...],
     settings: TieSettings,
-    again: tuple[int, Sequence[tuple[Shift, ...]]] = (0, ()),
+    again: tuple[int, Sequence[tuple[Shift, ...]], MountingChanges] | None = None,
 ) -> list[TieTask]:
     """Returns tasks over all places, each with a key of what its ties depend on.
 
-    again : round, and shifts of each place's traverses; none where the recorded poses place the readings.
+    again : round, shifts of each place's traverses, and changes of mountings; none where the recorded poses and the
+    stated mountings place the readings.
     """
-    code, (number, shifts) = code_digest(f"{__name__}:collect_ties"), again
+    code, (number, shifts, changes) = code_digest(f"{__name__}:collect_ties"), again or (0, (), {})
     shaping = [code, settings.model_dump(mode="json"), plan.ground.max_gap_s, runs]
     tasks = []
     for start in range(0, len(places), _PLACES):
         own, moved = tuple(places[start : start + _PLACES]), tuple(shifts[start : start + _PLACES])
         files = tuple(near_files(sources, [t for place in own for t in place.traverses], runs))
         seen = [one.key(road_key(one.source)) for one in files]
-        key = key_of(shaping, [asdict(place) for place in own], seen, *([number, moved] if number else []))
-        tasks.append(TieTask(plan.store, plan.ground, settings, runs, own, files, key, number, moved))
+        changed = {sensor: one.change.values.tolist() for sensor, one in remounted_of(files, changes).items()}
+        later = [number, moved, *sorted(changed.items())] if number else []
+        key = key_of(shaping, [asdict(place) for place in own], seen, *later)
+        tasks.append(TieTask(plan.store, plan.ground, settings, runs, own, files, key, number, moved, changes))
     return tasks
 
 
 def collect_ties(task: TieTask) -> OutputRecord:
     """Compare the passes at some places and write the ties (runs on a worker)."""
     apart_m, one_in = _APART * task.settings.shift_cell_m, task.settings.one_return_in
-    reader = NearReader(task.store, task.ground, task.files, task.runs, apart_m, one_in)
+    files = [one.remounted(task.changes) for one in task.files]
+    reader = NearReader(task.store, task.ground, files, task.runs, apart_m, one_in)
     moves = zip(task.places, task.shifts_m or [None] * len(task.places), strict=True)
     found = Ties.joined([ties_of(reader, place, task.settings, shifts) for place, shifts in moves])
     if not found.observations.size:
         return OutputRecord(TIES, task.unit, task.key, "", 0, "")
+    found = _as_stated(found, task)
     schema = table_schema(TIES)
     content = parquet_bytes(_rows(found, task.runs, task.round), schema)
     target = f"{schema.location}/{task.unit}.parquet"
@@ -151,6 +158,20 @@ def ties_of(reader: NearReader, place: Place, settings: TieSettings, shifts_m: S
     ]  # fmt: skip
     away = np.einsum("eni,nei->n", np.array(ends), found.observations.partials[:, :, :3])
     observed = found.observations.observed_m + away
+    return Ties(replace(found.observations, observed_m=observed), {**found.columns, "value_m": observed})
+
+
+def _as_stated(found: Ties, task: TieTask) -> Ties:
+    """Returns ties that changed mountings placed, expressed in the stated ones."""
+    observed = found.observations.observed_m.copy()
+    turns = found.observations.partials[:, :, 3:]
+    shifts = np.stack([found.columns[name] for name in _SHIFTS], axis=-1).reshape(-1, 2, 3)
+    for (run, sensor), one in remounted_of(task.files, task.changes).items():
+        for k, end in enumerate(("first", "second")):
+            own = (found.columns[f"{end}_run"] == task.runs.index(run)) & (found.columns[f"{end}_sensor"] == sensor)
+            seat = one.seat(found.observations.epoch_gps_ns[own, k])
+            by, _ = mount_partials(shifts[own, k], turns[own, k], found.columns[_ARMS[k]][own], seat)
+            observed[own] += by @ one.change.values
     return Ties(replace(found.observations, observed_m=observed), {**found.columns, "value_m": observed})
 
 

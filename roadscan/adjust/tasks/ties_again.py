@@ -14,6 +14,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.adjust.adjustment import MountingErrors
+from roadscan.adjust.observations import MOUNTED
 from roadscan.adjust.patches import Shift
 from roadscan.adjust.places import Place, Traverse
 from roadscan.adjust.settings import AdjustConfig, TieSettings
@@ -28,9 +30,15 @@ from roadscan.core.counted import counted
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
+from roadscan.georeference.sources import MountingChanges
 from roadscan.poses.trajectory import Corrections
 
 _STILL: Final[Shift] = (0.0, 0.0, 0.0)  # No shift (m).
+_REMOUNTED_M: Final = 0.01
+"""A mounting is off by much where it moves a point so far (m) that lies `adjust.moved_arm_m` away: returns of a lidar
+from before and from behind a place then lie farther apart than their noise, and a height is not the mean of both."""
+_CHANGE_STEPS: Final = (0.001, 0.0001, 0.0001)
+"""Steps to which a lever arm (m), a turn (rad) and a scale are rounded, for the same reason as shifts."""
 _STEP_M: Final = 0.001
 """Step to which shifts are rounded (m), so that smaller changes of a solution keep the evidence."""
 
@@ -82,6 +90,8 @@ class Again:
     """Shifts of the traverses of each place that was measured again, by its number."""
     counts: tuple[int, ...] = ()
     """Number of places that were measured again, for each round."""
+    changes: MountingChanges = field(default_factory=dict)
+    """Changes of mountings with which ties and control points were measured last."""
     misplaced: Mapping[str, Float64] = field(default_factory=dict)
     """Runs that lie so far (3,; m) from others that their σ exclude it."""
     findings: tuple[Finding, ...] = ()
@@ -99,6 +109,7 @@ class Again:
     def line(self) -> str:
         """Returns the rounds in words; "" where nothing was measured again."""
         told = f"ties observed again where the solution puts the passes: {', then '.join(map(str, self.counts))} places"
+        told += ", with the mountings that were found, and so is control" if self.changes else ""
         return told if self.counts else ""
 
 
@@ -135,12 +146,14 @@ def settled(
     solution = solve(again.ties, again.control)
     tied, findings = config.mode in ("joint", "vertical"), list[Finding]()
     while tied and config.again.rounds:
-        more, shifts, largest_m = _places_again(plan, sources, again, solution.corrections)
+        changes = _changed(solution.mountings, again, config)
+        more, shifts, largest_m = _places_again(plan, sources, again, solution.corrections, changes)
         if not more:
             break
         if len(again.counts) == config.again.rounds:
+            turned = "" if changes is again.changes else ", and mountings,"
             text = (
-                f"the solution still moves passes against one another by up to {1e3 * largest_m:.0f} mm at "
+                f"the solution still moves passes against one another by up to {1e3 * largest_m:.0f} mm{turned} at "
                 f"{len(shifts)} places after ties were observed again {counted(config.again.rounds, 'time')} "
                 "(adjust.again.rounds)"
             )
@@ -150,12 +163,28 @@ def settled(
         tasks = (*again.tasks, *more)
         ties = load(tasks)
         joined = ties if again.far is None else _still_needed(plan, sources, ties, again.far)
-        counts, control = (*again.counts, len(shifts)), _points_again(plan, sources, again, solution.corrections)
+        control = _points_again(plan, sources, again, solution.corrections, changes)
         again = replace(
-            again, tasks=tasks, ties=joined, shifts={**again.shifts, **shifts}, counts=counts, control=control
-        )
+            again, tasks=tasks, ties=joined, shifts={**again.shifts, **shifts}, counts=(*again.counts, len(shifts)),
+            control=control, changes=changes,
+        )  # fmt: skip
         solution = solve(joined, control)
     return again, solution, findings
+
+
+def _changed(found: MountingErrors | None, again: Again, config: AdjustConfig) -> MountingChanges:
+    """Returns changes of the mountings with which ties and control are to be measured: those of the last measurement
+    where no sensor is moved by much since then.
+    """
+    changes = {} if found is None else {sensor: one.rounded(_CHANGE_STEPS) for sensor, one in found.changes.items()}
+    for sensor in {*changes, *again.changes}:
+        none = np.zeros(len(MOUNTED))
+        now, before = (none if (one := own.get(sensor)) is None else one.values for own in (changes, again.changes))
+        moved = np.abs(now - before)
+        turned = float(np.linalg.norm(moved[3:6]) + moved[6])
+        if float(np.linalg.norm(moved[:3])) + config.moved_arm_m * turned > _REMOUNTED_M:
+            return changes
+    return again.changes
 
 
 def _larger_patches(plan: SurveyPlan, sources: Sources, tasks: Sequence[TieTask], ties: KnownTies) -> list[TieTask]:
@@ -277,10 +306,14 @@ def _of_pairs(ties: KnownTies, pairs: Iterable[tuple[str, str]]) -> Bool:
 
 
 def _places_again(
-    plan: SurveyPlan, sources: Sources, again: Again, corrections: Mapping[str, Corrections]
+    plan: SurveyPlan,
+    sources: Sources,
+    again: Again,
+    corrections: Mapping[str, Corrections],
+    changes: MountingChanges,
 ) -> tuple[list[TieTask], dict[int, tuple[Shift, ...]], float]:
-    """Returns tasks for the places that a solution moves by too much since they were measured, their shifts, and the
-    largest move (m).
+    """Returns tasks for the places that a solution moves by too much since they were measured, or for all places where
+    mountings changed; their shifts, and the largest move (m).
     """
     config, runs = AdjustConfig.of(plan.survey), runs_of(plan)
     chosen, shifts, largest_m = list[Place](), dict[int, tuple[Shift, ...]](), 0.0
@@ -290,7 +323,8 @@ def _places_again(
         moved = np.array(own) - np.array(before)
         # Only the part along the patch counts: readings beside it are not compared, and those far above are refused.
         aside_m, above_m = _extent(moved[:, :2]), float(np.ptp(moved[:, 2]))
-        if aside_m > config.again.share * 2.0 * place.radius_m or above_m > 0.5 * config.ties.most_apart_m:
+        far = aside_m > config.again.share * 2.0 * place.radius_m or above_m > 0.5 * config.ties.most_apart_m
+        if far or changes is not again.changes:
             largest_m = max(largest_m, aside_m, above_m)
             reach_m = float(np.hypot(*np.array(own)[:, :2].T).max())
             times = 1.0 + reach_m / (place.radius_m + config.places.margin_m)
@@ -298,27 +332,34 @@ def _places_again(
             shifts[place.number] = own
     moves = [shifts[place.number] for place in chosen]
     number = len(again.counts) + 1
-    return tie_tasks(plan, sources, chosen, runs, config.ties, (number, moves)), shifts, largest_m
+    return tie_tasks(plan, sources, chosen, runs, config.ties, (number, moves, changes)), shifts, largest_m
 
 
 def _points_again(
-    plan: SurveyPlan, sources: Sources, again: Again, corrections: Mapping[str, Corrections]
+    plan: SurveyPlan,
+    sources: Sources,
+    again: Again,
+    corrections: Mapping[str, Corrections],
+    changes: MountingChanges,
 ) -> tuple[ControlTask, ...]:
-    """Returns tasks of control points, with those of points whose passes a solution moves by too much."""
+    """Returns tasks of control points, with those of points whose passes a solution moves by too much, and of all
+    points where mountings changed.
+    """
     config, runs = AdjustConfig.of(plan.survey), runs_of(plan)
     least_m, seen, moves = config.again.share * 2.0 * config.places.radius_m, [], []
     last = {task.point.number: task for task in again.control}
     for task in (one for one in again.control if one.round == 0):
         own = tuple(_shift(corrections.get(runs[one[0].run]), one[0]) for one in task.passes)
         before = last[task.point.number].shifts_m or (_STILL,) * len(own)
-        if np.hypot(*(np.array(own)[:, :2] - np.array(before)[:, :2]).T).max() > least_m:
+        moved_m = float(np.hypot(*(np.array(own)[:, :2] - np.array(before)[:, :2]).T).max())
+        if changes is not again.changes or moved_m > least_m:
             times = 1.0 + float(np.hypot(*np.array(own)[:, :2].T).max()) / config.targets.search_m
             seen.append((task.point, [tuple(_widened(t, times, config) for t in one) for one in task.passes]))
             moves.append(own)
     priors, number = priors_of(plan, sources, runs), len(again.counts) + 1
     picked = {(runs[one[0].run], task.point.name): place for task in again.control for one, place in zip(
         task.passes, task.picked, strict=True) if place is not None}  # fmt: skip
-    return (*again.control, *sighting_tasks(plan, sources, priors, seen, picked, (number, moves)))
+    return (*again.control, *sighting_tasks(plan, sources, priors, seen, picked, (number, moves, changes)))
 
 
 def _shift(corrections: Corrections | None, traverse: Traverse) -> Shift:

@@ -15,7 +15,8 @@ How much the walls lean that a lidar sees along a road tells a roll that no tie 
 the boresight that is too large by ρ (rad) lowers what is to the right: a wall whose normal has the component r to the
 right of the vehicle gets a normal that points ρ r down. Walls that stand back from the road, as retaining walls do, are
 no roll: how much all walls lean away from the road is a second unknown. Where a road has walls on one side alone, the
-stated σ of that unknown is that of the roll.
+stated σ of that unknown is that of the roll. Safety barriers of concrete lean back by 5 to 10°, and cars lean too: what
+is as low as these is no wall.
 """
 
 from __future__ import annotations
@@ -434,6 +435,10 @@ than the sides of cars and of banks."""
 _ALONG: Final = np.cos(np.radians(30.0))
 """The normal of a wall along the road has this component to the side, or more. Planes that face the drive are seen at
 a low angle, and few: corners, trees, cars."""
+_ABOVE_M: Final = 1.2
+"""A plane is part of a wall from this height (m) above the ground beside it on: higher than safety barriers."""
+_LEVEL: Final = np.cos(np.radians(18.0))
+"""The normal of a plane of the ground has this component downwards, or more."""
 _LEAST_WALLS: Final = 20
 """With fewer, one house that leans would decide."""
 _LEAST_PLACES: Final = 3
@@ -478,6 +483,7 @@ def leans(columns: Mapping[str, npt.NDArray[Any]], tracks: Sequence[Track], runs
     within = (columns["kind"] == PLANE) & (columns["first_run"] == columns["second_run"])
     within &= columns["first_sensor"] == columns["second_sensor"]
     within &= (np.abs(columns["direction_down"]) < np.sin(_STEEP_RAD)) & (np.abs(columns["first_by_right"]) > _ALONG)
+    within &= _above_ground_m(columns) > _ABOVE_M
     found = []
     for track in tracks:
         own = within & (columns["first_run"] == runs[track.run]) & (columns["first_sensor"] == track.sensor)
@@ -487,6 +493,15 @@ def leans(columns: Mapping[str, npt.NDArray[Any]], tracks: Sequence[Track], runs
         lean = _lean(track, {name: columns[name][first] for name in _NAMES})
         found += [] if lean is None else [lean]
     return found
+
+
+def _above_ground_m(columns: Mapping[str, npt.NDArray[Any]]) -> Float64:
+    """Returns the heights (n,) of plane ties above the ground of their place; NaN where no plane of the ground is."""
+    level, place = np.abs(columns["direction_down"]) > _LEVEL, columns["place"]
+    ground_m = np.full(place.size, np.nan)
+    for one in np.unique(place[level]):
+        ground_m[place == one] = np.median(columns["height_m"][level & (place == one)])
+    return np.asarray(columns["height_m"] - ground_m)
 
 
 def _lean(track: Track, walls: Mapping[str, npt.NDArray[Any]]) -> Lean | None:

@@ -152,6 +152,8 @@ class ControlVerdict:
     """Of the stated variances of all surveys."""
     shift: PlaneShift = NOT_SHIFTED
     """The shift that the heights of points on slopes show."""
+    squares: float = 0.0
+    """Weighted squares of all surveys against poses and ties, wrong ones too, with that shift."""
 
     @property
     def faults(self) -> int:
@@ -202,13 +204,21 @@ def judged(groups: Sequence[SurveyErrors], spread: SurveyErrors, rules: Adjustme
     """
     groups, spread = [_in_datum(own, rules) for own in groups], _in_datum(spread, rules)
     found, shift = _with_shift(groups, spread, rules)
+    found = replace(found, squares=_squares(_surveyed(shift.taken_from(spread), 1.0)))
     groups = [shift.taken_from(own) for own in groups]
     spread, parts = shift.taken_from(spread), sum(len(own.parts()) for own in groups)
     many = parts >= _MANY and len(found.left_out) > _FEW * parts
     if not many or rules.estimate_variance_components is False:
         return found
     factor = _survey_factor(groups)
-    return replace(_with_factor(groups, spread, rules, factor), shift=shift) if factor > 1.0 else found
+    if factor <= 1.0:
+        return found
+    return replace(_with_factor(groups, spread, rules, factor), shift=shift, squares=found.squares)
+
+
+def _squares(errors: SurveyErrors) -> float:
+    """Returns the weighted squares of the surveys' errors."""
+    return float(errors.away_m @ np.linalg.solve(errors.covariance_m2, errors.away_m)) if errors.away_m.size else 0.0
 
 
 def _with_shift(

@@ -173,17 +173,18 @@ def offset_findings(verdict: ControlVerdict, applied: AppliedOffset, points: int
     return found
 
 
-def shift_findings(shift: PlaneShift) -> list[Finding]:
-    """Returns findings on control whose heights show that it lies elsewhere in the plane."""
+def shift_findings(shift: PlaneShift, instead: str = "") -> list[Finding]:
+    """Returns findings on control whose heights show that it lies elsewhere in the plane; instead : what else would."""
     if not shift.sigmas:
         return []
     north, east = 1e3 * shift.shift_m
     sigma = 1e3 * np.sqrt(np.diag(shift.covariance_m2))
+    also = f"; {instead} would explain them as well, and nothing tells which it is" if instead else ""
     return [
         CONTROL_DATUM.finds(
             CONTROL, f"heights on slopes tell that the control lies {north:+.0f} mm north (σ {sigma[0]:.0f} mm) and "
             f"{east:+.0f} mm east (σ {sigma[1]:.0f} mm) of the road that it was surveyed on ({shift.sigmas:.1f} σ); "
-            "its heights are compared there, and σ holds what is not known of the shift",
+            f"its heights are compared there, and σ holds what is not known of the shift{also}",
         )
     ]  # fmt: skip
 

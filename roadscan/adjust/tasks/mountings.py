@@ -345,6 +345,16 @@ def causes(found: MountingErrors) -> tuple[Cause, ...]:
     return tuple(named)
 
 
+def rolls_in_words(rolls: Sequence[Cause]) -> str:
+    """Returns rolls of sensors that would explain a shift of the control as well; "" without any."""
+    words = [
+        f"a boresight roll of {_called(one.sensor)} that is off by {_told(-one.error, one.component, signed=True)} "
+        f"(σ {_told(one.sigma, one.component)})"
+        for one in rolls
+    ]
+    return " and ".join(words)
+
+
 def cause_line(found: Sequence[Cause]) -> str:
     """Returns what may be wrong with a mounting, where several errors would explain the same; "" for less than two."""
     if len(found) < 2:

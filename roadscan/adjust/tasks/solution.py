@@ -21,8 +21,8 @@ from roadscan.adjust.control import (
     far_in_height,
     observations_of,
 )
+from roadscan.adjust.control_test import APART, HEIGHT, PLACE
 from roadscan.adjust.control_test import COMPONENTS as _AXES
-from roadscan.adjust.control_test import HEIGHT, PLACE
 from roadscan.adjust.helmert import RigidFit, rigid_fit
 from roadscan.adjust.observations import (
     FIXED,
@@ -63,7 +63,15 @@ from roadscan.adjust.tasks.doubts import (
     wrong_points,
 )
 from roadscan.adjust.tasks.hand_ties import wrong_hand_ties
-from roadscan.adjust.tasks.mountings import Cause, Mounted, cause_line, causes, contradicted, disproved
+from roadscan.adjust.tasks.mountings import (
+    Cause,
+    Mounted,
+    cause_line,
+    causes,
+    contradicted,
+    disproved,
+    rolls_in_words,
+)
 from roadscan.adjust.tasks.near import Sources
 from roadscan.adjust.tasks.tie_work import KnownTies
 from roadscan.adjust.tasks.tracks import span_of
@@ -79,6 +87,9 @@ _CHANGED: Final = 6
 components that are off, each of which may show the next."""
 _MUCH_TOO_SMALL: Final = 4.0
 """Variance factor of attitudes from which on a turn of the sensors is asked instead: σ is half of what it should be."""
+_ROLL: Final = MOUNTED.index("roll_rad")
+_SEVERAL: Final = 2
+"""Wrong control points from which on a roll of the sensors is asked instead: one point alone is no sign of it."""
 _WIDE_RAD: Final = float(np.radians(5.0))
 """1 σ of a turn that is free: an error of the hand, not of an adjustment."""
 _SOUND: Final = 0.1
@@ -242,13 +253,13 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     if config.mode == "helmert":
         return _rigid_solution(plan, evidence, control, entering, found)
     entering_ties = _entering(evidence)
-    adjusted, first, named, approach = _adjusted(config, evidence, control.chosen(entering), config.mode)
+    adjusted, first, (named, rolls), approach = _adjusted(config, evidence, control.chosen(entering), config.mode)
     wrong_ties, said = wrong_hand_ties(evidence.ties, entering_ties, adjusted, config.control.false_alarm)
     if wrong_ties:
         found += said
         evidence = replace(evidence, ties=evidence.ties.refused(np.isin(evidence.ties.columns["name"], wrong_ties)))
         entering_ties = _entering(evidence)
-        adjusted, first, named, approach = _adjusted(config, evidence, control.chosen(entering), config.mode)
+        adjusted, first, (named, rolls), approach = _adjusted(config, evidence, control.chosen(entering), config.mode)
     weight = np.zeros(entering_ties.size)
     weight[entering_ties] = adjusted.weight[: int(entering_ties.sum())]
     points = _points(adjusted.control, first)
@@ -258,7 +269,9 @@ def solve(plan: SurveyPlan, evidence: Evidence) -> Solution:
     found += line_findings([one for one in wrong if one.name in of_lines], evidence.sightings)
     counting = len(_counting_points(adjusted.control))
     found += offset_findings(adjusted.verdict, adjusted.applied, counting)
-    found += shift_findings(adjusted.verdict.shift) + run_findings(evidence.runs, adjusted.run_factors)
+    found += shift_findings(adjusted.verdict.shift, rolls_in_words(rolls)) + run_findings(
+        evidence.runs, adjusted.run_factors
+    )
     outcome, free = None, None
     if approach is not None:
         outcome = outcome_of(approach, adjusted, evidence.points)
@@ -304,9 +317,9 @@ def _entering(evidence: Evidence) -> Bool:
 
 def _adjusted(
     config: AdjustConfig, evidence: Evidence, control: Observations, mode: Literal["joint", "each_pass", "vertical"]
-) -> tuple[Adjustment, int, tuple[Cause, ...], Approached | None]:
+) -> tuple[Adjustment, int, tuple[tuple[Cause, ...], tuple[Cause, ...]], Approached | None]:
     """Returns the adjustment of ties, control and pictures, the place that stands for point 0, possible faults of
-    mountings, and how pictures entered.
+    mountings and rolls of them that would explain a shift of the control as well, and how pictures entered.
 
     A mounting that is off by more than its stated σ allows would be drawn back by it: such a σ is taken to be as large
     as what was found, and the adjustment is made once more. Control that is off as a whole looks like lever arms of all
@@ -326,9 +339,11 @@ def _adjusted(
         joined = Observations.joined([joined, *more, approach.rows.observations])
         cameras = list(evidence.pictures.cameras)
     filmed = np.array([one.sensor in evidence.mounted.cameras for one in priors], bool)
-    found = adjust(joined, evidence.priors, settings, priors, cameras)
-    for _ in range(_CHANGED):
+    found, rolls = adjust(joined, evidence.priors, settings, priors, cameras), tuple[Cause, ...]()
+    for number in range(_CHANGED):
         changed = turned_for_good(joined, evidence.priors, settings, priors, cameras, found, filmed)
+        if changed is None and number == 0:
+            changed, rolls = rolled(joined, evidence.priors, settings, priors, cameras, found, filmed)
         changed = _better_stated(priors, found, filmed) if changed is None else changed
         if changed is None:
             break
@@ -349,7 +364,7 @@ def _adjusted(
             error=np.where(wrong[:, None], found.mountings.error, 0.0),
             sigma=np.where(wrong[:, None], found.mountings.sigma, estimated.sigma),
         )
-    return replace(found, mountings=replace(estimated, prior_sigma=stated)), first, named, approach
+    return replace(found, mountings=replace(estimated, prior_sigma=stated)), first, (named, rolls), approach
 
 
 def _better_stated(
@@ -386,19 +401,73 @@ def turned_for_good(
     they widen the process of the poses until this takes up the turn.
     """
     wide = [axis for name, axis in TURNS.items() if found.variance_factors[name] > _MUCH_TOO_SMALL]
-    asked = np.isin(np.arange(len(MOUNTED)), wide)
-    free = tuple(
-        one if is_camera else replace(one, sigma=np.where(asked & (one.sigma > 0.0), _WIDE_RAD, one.sigma))
-        for one, is_camera in zip(priors, filmed.tolist(), strict=True)
-    )
-    if not any((one.sigma < other.sigma).any() for one, other in zip(priors, free, strict=True)):
+    free = _free(priors, wide, filmed)
+    if free is None:
         return None
     turned = adjust(observations, poses, settings, free, cameras)
     if any(turned.variance_factors[name] > 1.0 for name, axis in TURNS.items() if axis in wide):
         return None
+    return _allowed(priors, free, turned)
+
+
+def rolled(
+    observations: Observations,
+    poses: Sequence[RunPrior],
+    settings: AdjustmentSettings,
+    priors: Sequence[MountingPrior],
+    cameras: Sequence[CameraPrior],
+    found: Adjustment,
+    filmed: Bool,
+) -> tuple[tuple[MountingPrior, ...] | None, tuple[Cause, ...]]:
+    """Returns priors of mountings that allow a roll, where a roll of the sensors explains much better what control says
+    than a shift of it in the plane or wrong points do; else None, and the rolls that explain it about as well.
+
+    On a road that falls to its sides, control that lies aside and a sensor that is rolled change heights alike. What
+    counts are the weighted squares of the surveys, and of the errors that ties have in common: these would have to hide
+    the roll.
+    """
+    none = tuple[Cause, ...]()
+    if not found.verdict.shift.sigmas and len(found.verdict.wrong) < _SEVERAL:
+        return None, none
+    free = _free(priors, [_ROLL], filmed)
+    if free is None:
+        return None, none
+    other = adjust(observations, poses, settings, free, cameras)
+    gain = _contradiction(found) - _contradiction(other)
+    if other.verdict.faults or other.verdict.shift.sigmas or gain < -APART:
+        return None, none
+    if gain > APART:
+        return _allowed(priors, free, other), none
+    errors = other.mountings
+    return None, tuple(
+        Cause(errors.sensors[k], _ROLL, float(errors.error[k, _ROLL]), float(errors.sigma[k, _ROLL]))
+        for k in np.flatnonzero((errors.prior_sigma[:, _ROLL] >= _WIDE_RAD) & ~filmed).tolist()
+    )
+
+
+def _contradiction(found: Adjustment) -> float:
+    """Returns the weighted squares of surveys against poses and ties, and of the errors that ties have in common."""
+    return found.verdict.squares + float(found.common.error @ found.common.error)
+
+
+def _free(priors: Sequence[MountingPrior], axes: Sequence[int], filmed: Bool) -> tuple[MountingPrior, ...] | None:
+    """Returns priors that leave turns of sensors about some axes free; None where no such σ becomes larger."""
+    asked = np.isin(np.arange(len(MOUNTED)), axes)
+    free = tuple(
+        one if is_camera else replace(one, sigma=np.where(asked & (one.sigma > 0.0), _WIDE_RAD, one.sigma))
+        for one, is_camera in zip(priors, filmed.tolist(), strict=True)
+    )
+    is_wider = any((one.sigma < other.sigma).any() for one, other in zip(priors, free, strict=True))
+    return free if is_wider else None
+
+
+def _allowed(
+    priors: Sequence[MountingPrior], free: Sequence[MountingPrior], found: Adjustment
+) -> tuple[MountingPrior, ...]:
+    """Returns priors whose σ are as large as the turns that were found where these were free."""
     return tuple(
         replace(one, sigma=np.where(one.sigma < other.sigma, np.maximum(np.abs(error), one.sigma), one.sigma))
-        for one, other, error in zip(priors, free, turned.mountings.error, strict=True)
+        for one, other, error in zip(priors, free, found.mountings.error, strict=True)
     )
 
 

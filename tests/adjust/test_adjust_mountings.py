@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -110,16 +112,7 @@ TURNED_DEG = 0.4
 @pytest.mark.witness("mounting")
 def test_one_drive_tells_the_pitch_of_its_lidar_and_no_control_is_blamed(tmp_path: Path) -> None:
     """A lidar sees the same planes from before and from behind; variance components alone would widen the poses."""
-    scene = Scene.load("urban_street").changed(
-        length_m=50.0, passes=[{"lane": 2, "stops": []}], vehicle={"speed_m_per_s": 10.0, "standstill_s": 0.0},
-        profilers=OFF, camera=OFF, sick=OFF, imu=OFF, gnss=OFF, encoder=OFF,
-        lidar={"range_max_m": 30.0, "mount": {"error": {"pitch_deg": TURNED_DEG}}},
-        noise={
-            "position_m": 0.02, "down_m": 0.03, "attitude_deg": 0.01, "heading_deg": 0.03, "time_constant_s": 30.0,
-        },
-    )  # fmt: skip
-    one = Simulated(simulate(scene, tmp_path / "survey").survey_file)
-    adjust(one, stages=("ingest", "navigate", "footprints", "adjust"))
+    one = lidar_alone(tmp_path, {"length_m": 50.0}, {"pitch_deg": TURNED_DEG})
     table = read_small(one.store(), "mounting_corrections")
     assert table is not None
     [row] = table.to_pylist()
@@ -128,4 +121,37 @@ def test_one_drive_tells_the_pitch_of_its_lidar_and_no_control_is_blamed(tmp_pat
     findings = known_findings(Manifest(one.store()))
     [said] = [found for found in findings if found.witness == "mounting"]
     assert f"boresight pitch {pitch:+.4f}°" in said.text and "attitudes of all poses" in said.text
-    assert not [found for found in findings if found.witness in ("control_point", "stated_sigma")]
+    assert not [found for found in findings if found.witness in ("control_point", "control_datum", "stated_sigma")]
+
+
+@pytest.mark.witness("mounting")
+def test_control_tells_the_roll_of_a_lidar_and_is_not_blamed_for_it(tmp_path: Path) -> None:
+    """On a road that falls to its sides, a lidar that is rolled looks like control that lies aside."""
+    one = lidar_alone(tmp_path, {}, {"roll_deg": TURNED_DEG})
+    table = read_small(one.store(), "mounting_corrections")
+    assert table is not None
+    [row] = table.to_pylist()
+    # The lidar is tilted forward: a roll about its own axis turns it about two axes of the body.
+    tilt = math.radians(18.4)
+    for name, truth_deg in (("roll", -TURNED_DEG * math.cos(tilt)), ("heading", TURNED_DEG * math.sin(tilt))):
+        found, sigma = np.degrees(row[f"{name}_rad"]), np.degrees(row[f"sigma_{name}_rad"])
+        assert abs(found - truth_deg) < 3.0 * sigma < 0.15
+    findings = known_findings(Manifest(one.store()))
+    assert [found for found in findings if found.witness == "mounting" and "boresight roll" in found.text]
+    assert not [found for found in findings if found.witness in ("control_point", "control_datum", "stated_sigma")]
+
+
+def lidar_alone(folder: Path, changes: Mapping[str, object], error: Mapping[str, float]) -> Simulated:
+    """Adjusts one drive along `urban_street` whose lidar, its only sensor, is mounted otherwise than stated."""
+    scene = Scene.load("urban_street").changed(
+        passes=[{"lane": 2, "stops": []}], vehicle={"speed_m_per_s": 10.0, "standstill_s": 0.0},
+        profilers=OFF, camera=OFF, sick=OFF, imu=OFF, gnss=OFF, encoder=OFF,
+        lidar={"range_max_m": 30.0, "mount": {"error": dict(error)}},
+        noise={
+            "position_m": 0.02, "down_m": 0.03, "attitude_deg": 0.01, "heading_deg": 0.03, "time_constant_s": 30.0,
+        },
+        **changes,
+    )  # fmt: skip
+    one = Simulated(simulate(scene, folder / "survey").survey_file)
+    adjust(one, stages=("ingest", "navigate", "footprints", "adjust"))
+    return one

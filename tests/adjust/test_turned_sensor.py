@@ -10,9 +10,10 @@ import numpy.typing as npt
 import pytest
 
 from roadscan.adjust.adjustment import Adjustment, adjust
-from roadscan.adjust.observations import KINDS, MOUNTED, GaussMarkov, MountingPrior, Observations, RunPrior
+from roadscan.adjust.observations import FIXED, KINDS, MOUNTED, GaussMarkov, MountingPrior, Observations, RunPrior
 from roadscan.adjust.settings import AdjustmentSettings
-from roadscan.adjust.tasks.solution import turned_for_good
+from roadscan.adjust.tasks.mountings import Cause, rolls_in_words
+from roadscan.adjust.tasks.solution import rolled, turned_for_good
 
 PITCH = 4  # of poses, and of mountings
 STATED_RAD = math.radians(0.01)
@@ -74,3 +75,58 @@ def test_attitudes_as_stated_ask_nothing() -> None:
     found = adjusted(observed, MOUNTING)
     assert turned_for_good(observed, [DRIVE], SETTINGS, [MOUNTING], [], found, np.zeros(1, bool)) is None
     assert abs(np.degrees(found.mountings.error[0, PITCH])) < 0.01
+
+
+ROLL = 3
+ROLLED = MountingPrior("lidar", np.where(np.arange(len(MOUNTED)) == ROLL, STATED_RAD, 0.0))
+
+
+def control(
+    roll_rad: float, shift_m: tuple[float, float], beside_m: npt.NDArray[np.float64], fall: float = 0.025
+) -> Observations:
+    """Heights of control on a road to the north that falls from its crown to both sides, as a lidar on it sees them."""
+    rng, n = np.random.default_rng(8), beside_m.size
+    normal = np.stack([0.03 * rng.choice([-1.0, 1.0], n), fall * np.sign(beside_m), -np.ones(n)], axis=-1)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    arm = np.stack([np.zeros(n), beside_m, np.full(n, 2.0)], axis=-1)
+    partials, mounts = np.zeros((n, 2, 6)), np.zeros((n, 2, len(MOUNTED)))
+    partials[:, 0, :3], partials[:, 0, 3:] = normal, np.cross(arm, normal)
+    mounts[:, 0, 3:6] = partials[:, 0, 3:]
+    away = partials[:, 0, ROLL] * roll_rad + normal[:, :2] @ shift_m + rng.normal(0.0, 0.003, n)
+    return Observations(
+        np.full(n, KINDS.index("control_height"), np.uint8), np.tile(np.array([0, FIXED], np.int32), (n, 1)),
+        np.stack([np.linspace(1, SECONDS - 1, n) * 1e9, np.zeros(n)], axis=-1).astype(np.int64), partials, away,
+        np.full(n, 0.002), np.arange(n), np.arange(n), np.full(n, 0.002),
+        sensor=np.tile(np.array([0, -1], np.int32), (n, 1)), mount_partials=mounts,
+    )  # fmt: skip
+
+
+BESIDE_M = np.tile([-6.0, -2.0, 1.5, 5.0, -4.0, 3.0], 3)
+ON_GOOD_POSES = RunPrior("drive", 0, SECONDS * 10**9, (HELD, HELD, GaussMarkov(0.002, 600.0), HELD, HELD, HELD))
+
+
+def asked(observed: Observations) -> tuple[tuple[MountingPrior, ...] | None, tuple[Cause, ...]]:
+    settings = SETTINGS.model_copy(update={"estimate_variance_components": False})
+    found = adjust(observed, [ON_GOOD_POSES], settings, [ROLLED], [])
+    return rolled(observed, [ON_GOOD_POSES], settings, [ROLLED], [], found, np.zeros(1, bool))
+
+
+def test_a_roll_is_found_where_it_explains_control_better_than_a_shift_of_it() -> None:
+    priors, rolls = asked(control(math.radians(0.4), (0.0, 0.0), BESIDE_M))
+    assert priors is not None and rolls == ()
+    assert np.degrees(priors[0].sigma[ROLL]) == pytest.approx(0.4, abs=0.05)
+
+
+def test_control_that_lies_aside_is_no_roll() -> None:
+    assert asked(control(0.0, (0.5, -0.6), BESIDE_M)) == (None, ())
+
+
+def test_a_roll_that_explains_control_as_well_as_a_shift_does_is_told() -> None:
+    # All points lie as far to the side: their heights say the same of a roll and of a shift across.
+    priors, [roll] = asked(control(0.0, (0.0, 0.6), np.tile([-3.5, 3.5], 9)))
+    assert priors is None and roll.sensor == ("*", "lidar") and roll.component == ROLL
+    assert "boresight roll of lidar that is off by" in rolls_in_words([roll])
+
+
+def test_right_control_asks_for_no_roll() -> None:
+    assert asked(control(0.0, (0.0, 0.0), BESIDE_M)) == (None, ())

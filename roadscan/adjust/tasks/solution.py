@@ -64,6 +64,7 @@ from roadscan.adjust.tasks.doubts import (
 )
 from roadscan.adjust.tasks.hand_ties import wrong_hand_ties
 from roadscan.adjust.tasks.mountings import (
+    DOUBTED,
     Cause,
     Mounted,
     cause_line,
@@ -321,9 +322,9 @@ def _adjusted(
     """Returns the adjustment of ties, control and pictures, the place that stands for point 0, possible faults of
     mountings and rolls of them that would explain a shift of the control as well, and how pictures entered.
 
-    A mounting that is off by more than its stated σ allows would be drawn back by it: such a σ is taken to be as large
-    as what was found, and the adjustment is made once more. Control that is off as a whole looks like lever arms of all
-    sensors that are off: they are not estimated then, and the control is what is doubted. A sensor whose mounting
+    A mounting that is off by more than its stated σ allows would be drawn back by it: such a σ is taken to be larger
+    than what was found, and the adjustment is made once more. Control that is off as a whole looks like lever arms of
+    all sensors that are off: they are not estimated then, and the control is what is doubted. A sensor whose mounting
     nothing contradicts keeps the stated one: what would be estimated is the noise of the evidence.
     """
     ties = evidence.ties.observations
@@ -380,7 +381,8 @@ def _better_stated(
     off = disproved(found.mountings) & ~filmed[:, None]
     if not off.any():
         return None
-    sigma = np.where(off, np.abs(found.mountings.error), found.mountings.prior_sigma)
+    # What was found was drawn back by the stated σ, so what is off is larger.
+    sigma = np.where(off, DOUBTED * np.abs(found.mountings.error), found.mountings.prior_sigma)
     return tuple(replace(one, sigma=own) for one, own in zip(priors, sigma, strict=True))
 
 
@@ -420,21 +422,24 @@ def rolled(
     filmed: Bool,
 ) -> tuple[tuple[MountingPrior, ...] | None, tuple[Cause, ...]]:
     """Returns priors of mountings that allow a roll, where a roll of the sensors explains much better what control says
-    than a shift of it in the plane or wrong points do; else None, and the rolls that explain it about as well.
+    than a shift of it in the plane, wrong points or a bad survey do; else None, and the rolls that explain it about as
+    well.
 
     On a road that falls to its sides, control that lies aside and a sensor that is rolled change heights alike. What
     counts are the weighted squares of the surveys, and of the errors that ties have in common: these would have to hide
     the roll.
     """
     none = tuple[Cause, ...]()
-    if not found.verdict.shift.sigmas and len(found.verdict.wrong) < _SEVERAL:
+    verdict = found.verdict
+    if not verdict.shift.sigmas and len(verdict.wrong) < _SEVERAL and verdict.survey_factor == 1.0:
         return None, none
     free = _free(priors, [_ROLL], filmed)
     if free is None:
         return None, none
     other = adjust(observations, poses, settings, free, cameras)
     gain = _contradiction(found) - _contradiction(other)
-    if other.verdict.faults or other.verdict.shift.sigmas or gain < -APART:
+    contradicted_still = other.verdict.faults or other.verdict.shift.sigmas or other.verdict.survey_factor > 1.0
+    if contradicted_still or gain < -APART:
         return None, none
     if gain > APART:
         return _allowed(priors, free, other), none

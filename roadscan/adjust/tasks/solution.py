@@ -341,10 +341,12 @@ def _adjusted(
         cameras = list(evidence.pictures.cameras)
     filmed = np.array([one.sensor in evidence.mounted.cameras for one in priors], bool)
     found, rolls = adjust(joined, evidence.priors, settings, priors, cameras), tuple[Cause, ...]()
-    for number in range(_CHANGED):
+    is_roll_asked = False
+    for _ in range(_CHANGED):
         changed = turned_for_good(joined, evidence.priors, settings, priors, cameras, found, filmed)
-        if changed is None and number == 0:
+        if changed is None and not is_roll_asked:
             changed, rolls = rolled(joined, evidence.priors, settings, priors, cameras, found, filmed)
+            is_roll_asked = True
         changed = _better_stated(priors, found, filmed) if changed is None else changed
         if changed is None:
             break

@@ -93,8 +93,8 @@ def test_rays_at_leaning_shafts_are_those_that_numpy_counts() -> None:
     starts[4] = np.nan
     ends[5] = starts[5]
     shafts = np.array([
-        [0.0, 0.0, 1.5, 0.0, 0.0, 0.1, 0.5, 3.0], [3.0, 3.2, 1.0, 0.15, -0.1, 0.3, 0.2, 4.0],
-        [-4.0, 5.0, 2.0, -0.2, 0.0, 0.05, 0.0, 5.0],
+        [0.0, 0.0, 1.5, 0.0, 0.0, 0.1, 0.5, 3.0, 0.5], [3.0, 3.2, 1.0, 0.15, -0.1, 0.3, 0.2, 4.0, 1.25],
+        [-4.0, 5.0, 2.0, -0.2, 0.0, 0.05, 0.0, 5.0, 1.05],
     ])  # fmt: skip
     reach_m, limits = 6.0, (0.6, 0.15, 0.3, 0.1, 0.4)
     middle, before, behind, least, most = limits
@@ -102,14 +102,14 @@ def test_rays_at_leaning_shafts_are_those_that_numpy_counts() -> None:
     cell_m, edge = 3.0, 10  # each shaft is listed for all cells: the list may hold more than is near
     cells = np.arange(edge * edge + 1) * len(shafts), np.tile(np.arange(len(shafts)), edge * edge), edge, edge
     counts = np.zeros((len(shafts), 3, 2), np.int64)
-    rays_at_shafts(rays, shafts, cells, np.array([-15.0, -15.0]), cell_m, reach_m, limits, counts)
+    rays_at_shafts(rays, shafts, cells, np.array([-15.0, -15.0]), cell_m, 2.0, reach_m, limits, counts)
 
     way = ends - starts
     length = np.hypot(way[:, 0], way[:, 1])
     with np.errstate(invalid="ignore"):
         unit = way / length[:, None]
     expected = np.zeros_like(counts)
-    for k, (x, y, middle_m, slope_x, slope_y, radius, low, top) in enumerate(shafts.tolist()):
+    for k, (x, y, middle_m, slope_x, slope_y, radius, low, top, _) in enumerate(shafts.tolist()):
         at, height = np.broadcast_to([x, y], (len(ends), 2)), np.zeros(len(ends))
         for _ in range(2):
             along = ((at - starts[:, :2]) * unit[:, :2]).sum(axis=1)

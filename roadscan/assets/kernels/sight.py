@@ -163,7 +163,7 @@ def find_hidden(eye_m, place_m, epoch_gps_ns, keys, spans_gps_ns, shape, edge_m,
 
 
 @kernel
-def rays_at_shafts(rays, shafts, cells, corner, cell_m, reach_m, limits_m, counts):
+def rays_at_shafts(rays, shafts, cells, corner, cell_m, step_m, reach_m, limits_m, counts):
     """Count the rays at upright cylinders: those that end on one, that go through it, and that pass on either side.
 
     A ray that ends before a cylinder tells nothing of it.
@@ -171,11 +171,13 @@ def rays_at_shafts(rays, shafts, cells, corner, cell_m, reach_m, limits_m, count
     Parameters
     ----------
     rays : Rays; those of no length, and those whose beginning is not known, are left out.
-    shafts : (s, 8) x, y at a height, slopes in x and y, radius, heights of the lower and upper end (m).
+    shafts : (s, 9) x, y at a height, slopes in x and y, radius, heights of the lower and upper end, and how far from
+        that place a ray passes at most, seen from above (m).
     cells : shafts near each cell of a raster: (rows · columns + 1,) where those of a cell begin in a list, the list,
         the numbers of rows and of columns.
     corner : (2,) x and y of the raster's south-western corner (m).
-    cell_m : edge of a cell; a cylinder is listed for its own cell and the eight around it.
+    cell_m : edge of a cell.
+    step_m : rays are looked at in such steps; a cylinder is listed for each cell in which a ray near it may be.
     reach_m : rays that end farther from a cylinder, seen from above, do not count.
     limits_m : share of the radius within which rays meet a cylinder; how far before the surface a ray ends on it; how
         far behind the surface it passed; inner and outer edge of the strips on both sides, from the surface.
@@ -183,24 +185,28 @@ def rays_at_shafts(rays, shafts, cells, corner, cell_m, reach_m, limits_m, count
         that end there, those that pass.
     """
     starts, listed, rows, columns = cells
-    last = np.full(len(shafts), -1)
+    last, per_cell = np.full(len(shafts), -1), 1.0 / cell_m
+    steps = int(reach_m / step_m) + 3
     for i in range(rays.from_x.size):
         way_x, way_y = rays.to_x[i] - rays.from_x[i], rays.to_y[i] - rays.from_y[i]
         length = math.sqrt(way_x * way_x + way_y * way_y)
         if not length > 0.0:
             continue
         way_x, way_y = way_x / length, way_y / length
-        for step in range(int(2.0 * reach_m / cell_m) + 4):
-            back = 0.5 * cell_m * (step - 2)
-            column = math.floor((rays.to_x[i] - back * way_x - corner[0]) / cell_m)
-            row = math.floor((rays.to_y[i] - back * way_y - corner[1]) / cell_m)
-            if row < 0 or column < 0 or row >= rows or column >= columns:
-                continue
-            cell = row * columns + column
-            for n in range(starts[cell], starts[cell + 1]):
-                if last[listed[n]] != i:
-                    last[listed[n]] = i
-                    _count_at(rays, i, (way_x, way_y, length), shafts[listed[n]], reach_m, limits_m, counts[listed[n]])
+        back_x, back_y = step_m * way_x * per_cell, step_m * way_y * per_cell
+        x = (rays.to_x[i] - corner[0]) * per_cell + back_x
+        y = (rays.to_y[i] - corner[1]) * per_cell + back_y
+        for _ in range(steps):
+            if 0.0 <= x < columns and 0.0 <= y < rows:
+                cell = int(y) * columns + int(x)
+                for n in range(starts[cell], starts[cell + 1]):
+                    k = listed[n]
+                    if last[k] != i:
+                        last[k] = i
+                        across = (shafts[k, 1] - rays.to_y[i]) * way_x - (shafts[k, 0] - rays.to_x[i]) * way_y
+                        if abs(across) <= shafts[k, 8]:
+                            _count_at(rays, i, (way_x, way_y, length), shafts[k], reach_m, limits_m, counts[k])
+            x, y = x - back_x, y - back_y
 
 
 @inner

@@ -224,8 +224,9 @@ _STRIP_M: Final = (0.1, 0.4)
 """Edges of the strips on both sides of a shaft, from its surface (m): what stands by itself has them free."""
 _LEAST_LINES: Final = 4
 """Fewer lines do not tell what share of them passes."""
-_LINES_CELL_M: Final = 3.0
-"""Edge of the cells (m) by which lines find shafts: the widest, with its strips and lean, lies within one of them."""
+_LINES_CELL_M, _LINES_STEP_M = 1.0, 2.0
+"""Edge of the cells by which lines find shafts, and the step in which lines are followed (m): small cells list few
+shafts that a line does not come near, and long steps are few."""
 
 
 def features_of(scene: Scene, shafts: list[Shaft]) -> dict[str, Float64]:
@@ -343,18 +344,25 @@ def _sight(scene: Scene, shafts: list[Shaft]) -> dict[str, Float64]:
         [s.axis.x_m, s.axis.y_m, s.axis.height_m, s.axis.slope_x, s.axis.slope_y, s.axis.radius_m,
          s.ground_m + s.low_above_m, s.ground_m + s.top_above_m] for s in shafts
     ])  # fmt: skip
-    corner = table[:, :2].min(axis=0) - _LINES_CELL_M
-    column, row = np.floor((table[:, :2] - corner) / _LINES_CELL_M).astype(np.int64).T
-    rows, columns = int(row.max()) + 2, int(column.max()) + 2
-    around = np.array([(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
-    cell = (row[:, None] + around[:, 0]) * columns + column[:, None] + around[:, 1]
-    starts, order = in_bins(cell.ravel(), rows * columns)
+    past = np.abs(table[:, 6:8] - table[:, 2:3]).max(axis=1)
+    near = table[:, 5] + _STRIP_M[1] + np.hypot(table[:, 3], table[:, 4]) * past + 1e-3
+    reach = np.hypot(near, _LINES_STEP_M / 2.0) + _LINES_CELL_M * math.sqrt(0.5) + 1e-3
+    most = math.ceil(float(reach.max()) / _LINES_CELL_M) + 1
+    corner = table[:, :2].min(axis=0) - (most + 1) * _LINES_CELL_M
+    own = (table[:, :2] - corner) / _LINES_CELL_M
+    columns, rows = (np.floor(own.max(axis=0)).astype(np.int64) + most + 2).tolist()
+    around = np.arange(-most, most + 1)
+    cell = np.floor(own).astype(np.int64)[:, None] + np.stack(np.meshgrid(around, around), axis=-1).reshape(-1, 2)
+    away = np.linalg.norm(cell + 0.5 - own[:, None], axis=2) * _LINES_CELL_M
+    listed = away <= reach[:, None]
+    starts, order = in_bins(np.where(listed, cell[..., 1] * columns + cell[..., 0], -1).ravel(), rows * columns)
     counts = np.zeros((len(shafts), 3, 2), np.int64)
     limits = (_MIDDLE, _BEFORE_M, _BEHIND_M, *_STRIP_M)
-    cells = starts, order // len(around), rows, columns
+    cells = starts, order // len(around) ** 2, rows, columns
+    table = np.column_stack([table, near])
     for lines in (ends, scene.beyond_m):
         rays = Rays(*map(read_only, lines))
-        rays_at_shafts(rays, table, cells, corner, _LINES_CELL_M, LINES_M, limits, counts)
+        rays_at_shafts(rays, table, cells, corner, _LINES_CELL_M, _LINES_STEP_M, LINES_M, limits, counts)
 
     def passing(some: Int64) -> Float64:
         """Returns the share of some lines (n, 2) that pass; half a line more for either keeps it off 0 and 1."""

@@ -541,3 +541,13 @@ def error_of_stated(stated: Float64, right: npt.NDArray[Any], bins: int = 10) ->
     number = np.minimum((stated * bins).astype(int), bins - 1)
     bins_held = [number == b for b in np.unique(number)]
     return float(sum(abs(stated[b].mean() - right[b].mean()) * b.mean() for b in bins_held))
+
+
+def errors_of_exact(stated: Float64, draws: int = 4000) -> Float64:
+    """Calibration errors (draws,) that things with these probabilities (n,) show, each being right with just its own.
+
+    What is right in part, such as a kerb, is drawn as right or wrong: that is the most that chance can add.
+    """
+    return np.array(
+        [error_of_stated(stated, one < stated) for one in np.random.default_rng(1).random((draws, len(stated)))]
+    )

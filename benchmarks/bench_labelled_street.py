@@ -10,8 +10,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from benchmarks import street_scores as scores
-from benchmarks.asset_scores import calibration_error
+from benchmarks.asset_scores import calibration_error, errors_of_exact
 from benchmarks.labelled_street import LabelledStreet, labelled_street, recording_folder
 from benchmarks.settings import bench_folder
 from benchmarks.timing import Figure
@@ -52,3 +54,7 @@ def of_street(name: str, street: LabelledStreet) -> Iterator[Figure]:
     judged = scores.judged_objects(street)
     error = calibration_error(judged)
     yield Figure(f"{name}: calibration error of {len(judged)} objects", error, "", 0.08, "the bar")
+    chance = errors_of_exact(np.array([one.probability for one in judged]))
+    yield Figure(f"{name}: the same of exact probabilities, mean", float(chance.mean()), "")
+    yield Figure(f"{name}: the same of exact probabilities, 95 % of draws below", float(np.quantile(chance, 0.95)), "")
+    yield Figure(f"{name}: the same of exact probabilities, draws above the error", float((chance > error).mean()), "")

@@ -10,16 +10,19 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.judged_scenes import POLE, TRUNK, UNKNOWN, JudgedScene, judged_scenes
-from benchmarks.judgement import Segments
+from benchmarks.judgement import Segments, with_unknown
 from roadscan.assets.upright.shafts import Shaft
 from roadscan.assets.upright.slices import places_of
 from roadscan.assets.upright.standing import candidates_of, features_of
 
+SIGHT: Final = ("goes_through", "open_more", "open_less", "open_both")
+"""Features that clouds without a trajectory do not tell."""
 FIT: Final[dict[str, Any]] = {
-    "increasing": ("slices", "alone", "free", "filled", "alone_lower", "alone_upper", "to_surface_m", "returns"),
+    "increasing": ("slices", "alone", "free", "filled", "alone_lower", "alone_upper", "to_surface_m", "returns",
+                   *SIGHT[1:]),
     "decreasing": (
         "in_35_cm", "in_60_cm", "in_120_cm", "low_m", "residual_m", "rough", "more_lean_deg", "company_1_m",
-        "company_3_m", "straight_m", "widths_m", "own_building", "building", "opposite", "sides_taken",
+        "company_3_m", "straight_m", "widths_m", "own_building", "building", "opposite", "sides_taken", SIGHT[0],
     ),
     "rounds": 200, "num_leaves": 10, "feature_fraction": 0.4,
 }  # fmt: skip
@@ -34,7 +37,7 @@ def segments(folder: Path) -> Iterator[Segments]:
     for one in judged_scenes(folder):
         found = of_scene(one)
         if found.true.size:
-            yield found
+            yield from with_unknown([found], SIGHT)
 
 
 def of_scene(one: JudgedScene) -> Segments:

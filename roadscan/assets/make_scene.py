@@ -13,11 +13,11 @@ from roadscan.assets.ground.surface import Place
 from roadscan.assets.kernels.columns import marked
 from roadscan.assets.moving import REACH_M as ROAD_USERS_M
 from roadscan.assets.road_users import road_users
-from roadscan.assets.scene import Box, GroundModel, Returns, Scene, Statistics, extent_of
+from roadscan.assets.scene import LINES_M, Box, GroundModel, Returns, Scene, Statistics, extent_of
 from roadscan.assets.settings import GroundSettings
 from roadscan.assets.surroundings import REACH_M as SURROUNDINGS_M
 from roadscan.assets.surroundings import cubes_of, surroundings
-from roadscan.compute.array_types import Bool
+from roadscan.compute.array_types import Bool, Float64
 
 CLASSES_REACH_M: Final = max(ROAD_USERS_M, SURROUNDINGS_M)
 """What lies farther away (m) does not change the class of a return that does not lie on the ground."""
@@ -51,6 +51,7 @@ def make_scene(
     statistics = statistics if statistics is not None else Statistics()
     wider, widest = (window, window) if around is None else around
     ground = bare_earth(Place(returns, widest, settings, statistics))
+    beyond = lines_beyond(returns, window)
     if around is not None:
         rows = np.flatnonzero(wider.holds(returns.x_m, returns.y_m))
         returns, ground = returns.at(rows), ground.within(rows, wider)
@@ -68,7 +69,17 @@ def make_scene(
     if around is not None:
         rows = np.flatnonzero(window.holds(returns.x_m, returns.y_m))
         returns, ground, found = returns.at(rows), ground.within(rows, window), found[rows]
-    return Scene(returns, tile, window, ground.model, ground.above_m, found, drive, statistics)
+    return Scene(returns, tile, window, ground.model, ground.above_m, found, drive, statistics, beyond_m=beyond)
+
+
+def lines_beyond(returns: Returns, window: Box) -> Float64:
+    """Returns the sight lines (6, k) that end outside of a window, not farther than those of shafts are followed."""
+    wider = Box(*(side - LINES_M for side in window[:2]), *(side + LINES_M for side in window[2:]))
+    rows = np.flatnonzero(wider.holds(returns.x_m, returns.y_m) & ~window.holds(returns.x_m, returns.y_m))
+    return np.stack([
+        returns.sensor_x_m[rows], returns.sensor_y_m[rows], returns.sensor_height_m[rows], returns.x_m[rows],
+        returns.y_m[rows], returns.height_m[rows],
+    ])  # fmt: skip
 
 
 def on_road(returns: Returns, model: GroundModel, drive_xyh_m: npt.NDArray[np.float64]) -> Bool:

@@ -18,6 +18,10 @@ from roadscan.assets.quantiles import weighted_quantile
 from roadscan.compute.array_types import Bool, Float32, Float64
 from roadscan.compute.kernel_options import read_only
 
+LINES_M: Final = 30.0
+"""Sight lines that end farther from a thing than this (m) do not tell what stands there: squares are searched with what
+lies so far around them, since bare earth reads farther."""
+
 
 @dataclass(frozen=True, eq=False)
 class Returns:
@@ -232,6 +236,9 @@ class Scene:
     statistics: Statistics = field(default_factory=Statistics)
     whole: Scene | None = None
     """The scene of several tiles together that this one is a view of, with its own tile; None: it is none."""
+    beyond_m: Float64 = field(default_factory=lambda: np.zeros((6, 0)))
+    """(6, k) sight lines that end up to :data:`LINES_M` outside of the window: x, y, height of the sensor and of the
+    return."""
 
     def of_tile(self, tile: Box) -> Scene:
         """Returns the same scene for one of its tiles: what does not depend on the tile is computed once for all."""

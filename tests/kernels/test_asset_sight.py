@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from roadscan.assets.kernels.sight import Places, Rays, follow_rays, rays_near
+from roadscan.assets.kernels.sight import Places, Rays, follow_rays, rays_at_shafts, rays_near
 
 CELL_M = 0.5
 BANDS_M = np.array([-0.3, 0.5, 1.5, 3.0])
@@ -83,3 +83,48 @@ def test_rays_near_a_place_are_those_that_numpy_finds_and_those_sent_at_the_mome
     assert {(s, int(lasers[k])) for k, s in wanted} == set(
         zip(*map(np.ndarray.tolist, np.nonzero(answered)), strict=True)
     )
+
+
+def test_rays_at_leaning_shafts_are_those_that_numpy_counts() -> None:
+    random = np.random.default_rng(7)
+    starts = np.column_stack([random.uniform(-12, 12, (30_000, 2)), np.full(30_000, 2.0)])
+    ends = np.column_stack([random.uniform(-12, 12, (30_000, 2)), random.uniform(-1, 6, 30_000)])
+    ends[:3_000, :2] = random.normal([3.0, 3.2], 0.2, (3_000, 2))
+    starts[4] = np.nan
+    ends[5] = starts[5]
+    shafts = np.array([
+        [0.0, 0.0, 1.5, 0.0, 0.0, 0.1, 0.5, 3.0, 0.5], [3.0, 3.2, 1.0, 0.15, -0.1, 0.3, 0.2, 4.0, 1.25],
+        [-4.0, 5.0, 2.0, -0.2, 0.0, 0.05, 0.0, 5.0, 1.05],
+    ])  # fmt: skip
+    reach_m, limits = 6.0, (0.6, 0.15, 0.3, 0.1, 0.4)
+    middle, before, behind, least, most = limits
+    rays = Rays(*np.ascontiguousarray(np.hstack([starts, ends]).T))
+    cell_m, edge = 3.0, 10  # each shaft is listed for all cells: the list may hold more than is near
+    cells = np.arange(edge * edge + 1) * len(shafts), np.tile(np.arange(len(shafts)), edge * edge), edge, edge
+    counts = np.zeros((len(shafts), 3, 2), np.int64)
+    rays_at_shafts(rays, shafts, cells, np.array([-15.0, -15.0]), cell_m, 2.0, reach_m, limits, counts)
+
+    way = ends - starts
+    length = np.hypot(way[:, 0], way[:, 1])
+    with np.errstate(invalid="ignore"):
+        unit = way / length[:, None]
+    expected = np.zeros_like(counts)
+    for k, (x, y, middle_m, slope_x, slope_y, radius, low, top, _) in enumerate(shafts.tolist()):
+        at, height = np.broadcast_to([x, y], (len(ends), 2)), np.zeros(len(ends))
+        for _ in range(2):
+            along = ((at - starts[:, :2]) * unit[:, :2]).sum(axis=1)
+            height = starts[:, 2] + along * unit[:, 2]
+            at = np.array([x, y]) + (height - middle_m)[:, None] * [slope_x, slope_y]
+        to = at - starts[:, :2]
+        along, across = (to * unit[:, :2]).sum(axis=1), to[:, 1] * unit[:, 0] - to[:, 0] * unit[:, 1]
+        told = (along > 0.0) & (height >= low) & (height <= top)
+        told &= np.hypot(ends[:, 0] - x, ends[:, 1] - y) <= reach_m
+        beside = (np.abs(across) - radius > least) & (np.abs(across) - radius <= most)
+        for part, own in enumerate(
+            [np.abs(across) <= middle * radius, beside & (across < 0.0), beside & (across >= 0.0)]
+        ):
+            passed = told & own & (length - along > radius + behind)
+            ended = told & own & ~passed & (length - along >= -radius - (behind if part else before))
+            expected[k, part] = np.count_nonzero(ended), np.count_nonzero(passed)
+    assert (expected[1] > 20).all() and expected[..., 1].min() > 5
+    assert counts.tolist() == expected.tolist()

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.compute.kernel_options import inlined, kernel
+from roadscan.compute.kernel_options import inlined, inner, kernel
 
 
 class Rays(NamedTuple):
@@ -160,3 +160,78 @@ def find_hidden(eye_m, place_m, epoch_gps_ns, keys, spans_gps_ns, shape, edge_m,
                 at += 1
             if hidden[i]:
                 break
+
+
+@kernel
+def rays_at_shafts(rays, shafts, cells, corner, cell_m, step_m, reach_m, limits_m, counts):
+    """Count the rays at upright cylinders: those that end on one, that go through it, and that pass on either side.
+
+    A ray that ends before a cylinder tells nothing of it.
+
+    Parameters
+    ----------
+    rays : Rays; those of no length, and those whose beginning is not known, are left out.
+    shafts : (s, 9) x, y at a height, slopes in x and y, radius, heights of the lower and upper end, and how far from
+        that place a ray passes at most, seen from above (m).
+    cells : shafts near each cell of a raster: (rows · columns + 1,) where those of a cell begin in a list, the list,
+        the numbers of rows and of columns.
+    corner : (2,) x and y of the raster's south-western corner (m).
+    cell_m : edge of a cell.
+    step_m : rays are looked at in such steps; a cylinder is listed for each cell in which a ray near it may be.
+    reach_m : rays that end farther from a cylinder, seen from above, do not count.
+    limits_m : share of the radius within which rays meet a cylinder; how far before the surface a ray ends on it; how
+        far behind the surface it passed; inner and outer edge of the strips on both sides, from the surface.
+    counts : (s, 3, 2) int64, added to: rays at the cylinder, on its left as seen from the sensor, on its right; those
+        that end there, those that pass.
+    """
+    starts, listed, rows, columns = cells
+    last, per_cell = np.full(len(shafts), -1), 1.0 / cell_m
+    steps = int(reach_m / step_m) + 3
+    for i in range(rays.from_x.size):
+        way_x, way_y = rays.to_x[i] - rays.from_x[i], rays.to_y[i] - rays.from_y[i]
+        length = math.sqrt(way_x * way_x + way_y * way_y)
+        if not length > 0.0:
+            continue
+        way_x, way_y = way_x / length, way_y / length
+        back_x, back_y = step_m * way_x * per_cell, step_m * way_y * per_cell
+        x = (rays.to_x[i] - corner[0]) * per_cell + back_x
+        y = (rays.to_y[i] - corner[1]) * per_cell + back_y
+        for _ in range(steps):
+            if 0.0 <= x < columns and 0.0 <= y < rows:
+                cell = int(y) * columns + int(x)
+                for n in range(starts[cell], starts[cell + 1]):
+                    k = listed[n]
+                    if last[k] != i:
+                        last[k] = i
+                        across = (shafts[k, 1] - rays.to_y[i]) * way_x - (shafts[k, 0] - rays.to_x[i]) * way_y
+                        if abs(across) <= shafts[k, 8]:
+                            _count_at(rays, i, (way_x, way_y, length), shafts[k], reach_m, limits_m, counts[k])
+            x, y = x - back_x, y - back_y
+
+
+@inner
+def _count_at(rays, i, way, shaft, reach_m, limits_m, counts):
+    """Add a ray to the counts (3, 2) of a cylinder."""
+    if math.hypot(rays.to_x[i] - shaft[0], rays.to_y[i] - shaft[1]) > reach_m:
+        return
+    way_x, way_y, length = way
+    rise = (rays.to_height[i] - rays.from_height[i]) / length
+    x, y, along, height = shaft[0], shaft[1], 0.0, 0.0
+    for _ in range(2):  # the second time where the axis is at the height of the ray
+        along = (x - rays.from_x[i]) * way_x + (y - rays.from_y[i]) * way_y
+        height = rays.from_height[i] + along * rise
+        x, y = shaft[0] + (height - shaft[2]) * shaft[3], shaft[1] + (height - shaft[2]) * shaft[4]
+    along = (x - rays.from_x[i]) * way_x + (y - rays.from_y[i]) * way_y
+    across = (y - rays.from_y[i]) * way_x - (x - rays.from_x[i]) * way_y
+    if along <= 0.0 or height < shaft[6] or height > shaft[7]:
+        return
+    middle, before, behind, least, most = limits_m
+    radius, part = shaft[5], -1
+    if abs(across) <= middle * radius:
+        part = 0
+    elif least < abs(across) - radius <= most:
+        part, before = (1 if across < 0.0 else 2), behind
+    if part >= 0 and length - along > radius + behind:
+        counts[part, 1] += 1
+    elif part >= 0 and length - along >= -radius - before:
+        counts[part, 0] += 1

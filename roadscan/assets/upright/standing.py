@@ -11,12 +11,14 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets import classes
+from roadscan.assets.bins import in_bins
 from roadscan.assets.judgement.judge import Judge
 from roadscan.assets.kernels.shafts import RINGS, Part, about_shaft
+from roadscan.assets.kernels.sight import Rays, rays_at_shafts
 from roadscan.assets.moving import SLOT_NS
 from roadscan.assets.probabilities import logistic
 from roadscan.assets.quantiles import median
-from roadscan.assets.scene import Scene, once_a_scene
+from roadscan.assets.scene import LINES_M, Scene, once_a_scene
 from roadscan.assets.upright.regions import Region, regions_of
 from roadscan.assets.upright.shafts import ALONE_M, Shaft, shafts_of
 from roadscan.assets.upright.slices import SLICE_M, ground_light, places_of
@@ -214,6 +216,17 @@ _FAR_M: Final = 3.0
 """Surfaces are sought up to this distance (m)."""
 _LEAST_OF_SLICE: Final = 4
 """Slices with fewer returns show no middle and no width."""
+_MIDDLE: Final = 0.6
+"""Lines within this share of the radius meet a shaft: nearer to its rim a beam is met in part."""
+_BEFORE_M, _BEHIND_M = 0.15, 0.3
+"""A line that ends up to the first before a shaft's surface (m) ends on it, one that ends the second behind passed."""
+_STRIP_M: Final = (0.1, 0.4)
+"""Edges of the strips on both sides of a shaft, from its surface (m): what stands by itself has them free."""
+_LEAST_LINES: Final = 4
+"""Fewer lines do not tell what share of them passes."""
+_LINES_CELL_M, _LINES_STEP_M = 1.0, 2.0
+"""Edge of the cells by which lines find shafts, and the step in which lines are followed (m): small cells list few
+shafts that a line does not come near, and long steps are few."""
 
 
 def features_of(scene: Scene, shafts: list[Shaft]) -> dict[str, Float64]:
@@ -229,7 +242,8 @@ def features_of(scene: Scene, shafts: list[Shaft]) -> dict[str, Float64]:
         _itself(shaft) | _about(scene, shaft) | _company(places, k) | _surfaces(shaft, tall, low)
         for k, shaft in enumerate(shafts)
     ]
-    return {name: np.array([row[name] for row in rows], np.float64) for name in (rows[0] if rows else ())}
+    told = {name: np.array([row[name] for row in rows], np.float64) for name in (rows[0] if rows else ())}
+    return told | (_sight(scene, shafts) if shafts else {})
 
 
 def _itself(shaft: Shaft) -> dict[str, float]:
@@ -318,9 +332,52 @@ def _surfaces(shaft: Shaft, tall: list[Region], low: list[Region]) -> dict[str, 
     }
 
 
+def _sight(scene: Scene, shafts: list[Shaft]) -> dict[str, Float64]:
+    """Returns the shares (n,) of the sight lines at shafts that go through, and that pass beside them.
+
+    Posts and trunks stop each line and stand free: lines pass on both sides. Leaves and twigs let some through, and
+    edges of walls, hedges and cars stop those on one side. NaN where too few lines tell it.
+    """
+    returns = scene.returns
+    ends = returns.sensor_x_m, returns.sensor_y_m, returns.sensor_height_m, returns.x_m, returns.y_m, returns.height_m
+    table = np.array([
+        [s.axis.x_m, s.axis.y_m, s.axis.height_m, s.axis.slope_x, s.axis.slope_y, s.axis.radius_m,
+         s.ground_m + s.low_above_m, s.ground_m + s.top_above_m] for s in shafts
+    ])  # fmt: skip
+    past = np.abs(table[:, 6:8] - table[:, 2:3]).max(axis=1)
+    near = table[:, 5] + _STRIP_M[1] + np.hypot(table[:, 3], table[:, 4]) * past + 1e-3
+    reach = np.hypot(near, _LINES_STEP_M / 2.0) + _LINES_CELL_M * math.sqrt(0.5) + 1e-3
+    most = math.ceil(float(reach.max()) / _LINES_CELL_M) + 1
+    corner = table[:, :2].min(axis=0) - (most + 1) * _LINES_CELL_M
+    own = (table[:, :2] - corner) / _LINES_CELL_M
+    columns, rows = (np.floor(own.max(axis=0)).astype(np.int64) + most + 2).tolist()
+    around = np.arange(-most, most + 1)
+    cell = np.floor(own).astype(np.int64)[:, None] + np.stack(np.meshgrid(around, around), axis=-1).reshape(-1, 2)
+    away = np.linalg.norm(cell + 0.5 - own[:, None], axis=2) * _LINES_CELL_M
+    listed = away <= reach[:, None]
+    starts, order = in_bins(np.where(listed, cell[..., 1] * columns + cell[..., 0], -1).ravel(), rows * columns)
+    counts = np.zeros((len(shafts), 3, 2), np.int64)
+    limits = (_MIDDLE, _BEFORE_M, _BEHIND_M, *_STRIP_M)
+    cells = starts, order // len(around) ** 2, rows, columns
+    table = np.column_stack([table, near])
+    for lines in (ends, scene.beyond_m):
+        rays = Rays(*map(read_only, lines))
+        rays_at_shafts(rays, table, cells, corner, _LINES_CELL_M, _LINES_STEP_M, LINES_M, limits, counts)
+
+    def passing(some: Int64) -> Float64:
+        """Returns the share of some lines (n, 2) that pass; half a line more for either keeps it off 0 and 1."""
+        return np.where(some.sum(axis=-1) >= _LEAST_LINES, (some[..., 1] + 0.5) / (some.sum(axis=-1) + 1.0), np.nan)
+
+    sides = passing(counts[:, 1:])
+    return {
+        "goes_through": passing(counts[:, 0]), "open_more": np.fmax(*sides.T), "open_less": np.minimum(*sides.T),
+        "open_both": passing(counts[:, 1:].sum(axis=1)),
+    }  # fmt: skip
+
+
 Standing = Literal["pole", "lighting", "signal", "tree", "delineator"]
 
-POST: Final = Judge("post", "feb5bafecf6e42d0")
+POST: Final = Judge("post", "f06eb8d459251758")
 """Does a shaft stand by itself, as poles, posts and trunks do?"""
 LEAST: Final = 0.5
 """Less probable shafts are left out."""

@@ -72,8 +72,8 @@ def test_poles_and_trunks_of_products_of_sweeps_that_no_judge_was_fitted_to(tmp_
     street = labelled_street(recording_folder(), tmp_path / "street", range(4, 8))
     found = poles_and_trunks(street)
     assert found.wanted >= 19
-    assert found.recall >= 0.70  # 0.74; 0.80 is asked for
-    assert found.precision >= 0.80  # 0.89
+    assert found.recall >= 0.75  # 0.79; 0.80 is asked for
+    assert found.precision >= 0.85  # 0.89
     assert share_of_class(street, TRUNK, classes.VEHICLE) <= 0.02
 
 

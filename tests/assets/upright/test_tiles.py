@@ -10,8 +10,10 @@ import pytest
 
 from roadscan.assets.kind import AssetObject, asset_kinds
 from roadscan.assets.kinds.surfaces import parts_of
+from roadscan.assets.make_scene import lines_beyond
 from roadscan.assets.scene import Box, Scene
 from roadscan.assets.upright.lines import PIECE_SCHEMA, STRETCHES, Chain, chains_of
+from roadscan.assets.upright.standing import candidates_of, features_of
 from tests.assets.upright.scene import objects_of, simulated
 
 TILE_M, HALO_M = 20.0, 8.0
@@ -30,6 +32,7 @@ def tiles() -> list[Scene]:
                 scene = Scene(
                     whole.returns.at(inside), Box(x, y, x + TILE_M, y + TILE_M), window, whole.ground,
                     whole.above_ground_m[inside], whole.classes[inside], whole.drive_xyh_m,
+                    beyond_m=lines_beyond(whole.returns, window),
                 )  # fmt: skip
                 out.append(scene)
     return out
@@ -57,6 +60,27 @@ def test_tiles_of_one_scene_hold_what_it_holds(kind: str) -> None:
     parts, whole = joined(kind, [scene.of_tile(one.tile) for one in tiles()]), objects_of(scene, kind)
     assert len(whole) > 0
     assert [(one.geometry.wkb, one.attributes) for one in parts] == [(o.geometry.wkb, o.attributes) for o in whole]
+
+
+def test_as_many_sight_lines_meet_a_shaft_however_tiles_are_cut() -> None:
+    whole, _ = simulated()
+    names = ("goes_through", "open_more", "open_less", "open_both")
+
+    def told(scene: Scene) -> dict[tuple[float, ...], list[float]]:
+        shafts = candidates_of(scene)
+        features = features_of(scene, shafts)
+        return {
+            (*np.round(s.foot_xy_m, 4).tolist(), float(s.slices)): [round(float(features[n][k]), 9) for n in names]
+            for k, s in enumerate(shafts)
+            if scene.tile.holds(*s.foot_xy_m)
+        }
+
+    every = told(whole)
+    parts = {place: values for scene in tiles() for place, values in told(scene).items()}
+    same = [place for place in parts if place in every]
+    assert len(same) > 0.9 * len(every) > 10
+    assert str([parts[place] for place in same]) == str([every[place] for place in same])
+    assert np.isfinite([every[place] for place in same]).mean() > 0.5
 
 
 @pytest.mark.parametrize("kind", ["guardrail", "fence", "wall", "facade"])

@@ -378,13 +378,6 @@ def with_tags(jpeg: bytes, exif: bytes, xmp: bytes) -> bytes:
     return _START + _segment(content) + _segment(_XMP + xmp) + _without_tags(jpeg)
 
 
-def without_tags(jpeg: bytes) -> bytes:
-    """Return a JPEG without EXIF and XMP; raises ValueError where it is none."""
-    if not jpeg.startswith(_START):
-        raise ValueError("it does not begin as a JPEG")
-    return _START + _without_tags(jpeg)
-
-
 def with_comment(jpeg: bytes, text: str) -> bytes:
     """Return a JPEG with a comment (COM) after its start; raises ValueError where it is none."""
     if not jpeg.startswith(_START):

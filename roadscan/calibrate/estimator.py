@@ -131,8 +131,6 @@ class Calibration:
     figures: tuple[Figures, ...]
     corrections: dict[int, Correction]
     """Errors of the poses, by traverse."""
-    correction_sigma: dict[int, Float64]
-    """(6,) 1 σ of them, m and rad."""
     objects: dict[str, ObjectPose]
     rounds: int
     """Number of times that the evidence was searched for."""
@@ -297,7 +295,6 @@ class _Adjustment:
         change = system.now.derivative[:size, :size]
         covariance = change @ seen.covariance @ change.T
         keep = np.concatenate([MOUNTING * i + np.arange(6) for i in range(len(self.unknowns.priors))])
-        spread = np.sqrt(np.diag(self.unknowns.root @ system.covariance @ self.unknowns.root.T))
         return Calibration(
             sensors={name: self._calibrated(name, estimate, covariance, seen) for name in self.unknowns.priors},
             covariance=covariance[np.ix_(keep, keep)],
@@ -305,9 +302,6 @@ class _Adjustment:
             kinds=system.kind_figures(),
             figures=_figures(system.weighed, before),
             corrections=estimate.corrections,
-            correction_sigma={
-                int(key): spread[self.unknowns.body_slice(body)] for body, key in enumerate(self.unknowns.traverse_keys)
-            },
             objects=estimate.objects,
             rounds=self.rounds,
             iterations=self.iterations,

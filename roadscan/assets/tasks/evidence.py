@@ -44,7 +44,6 @@ SCREENS: Final = "asset_screens"
 """Manifest name of the occluders of views."""
 VISIBILITY: Final = "asset_visibility"
 """Cells of a square, and how many passes had them in sight."""
-OF_SQUARES: Final = (EVIDENCE, CLASSIFIED, BARE_EARTH, SCREENS, VISIBILITY)
 
 
 def evidence_unit(kind: str, square: TileId) -> str:
@@ -60,7 +59,7 @@ class SquareWork:
     kinds: tuple[tuple[str, str], ...]
     """Names of the kinds whose evidence is due, with its key."""
     beside: Mapping[str, str]
-    """Other outputs that are due: the key of each of :data:`OF_SQUARES` by its name."""
+    """Other outputs that are due: the key of each, by its name in the manifest."""
 
 
 @dataclass(frozen=True)

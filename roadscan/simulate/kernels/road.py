@@ -23,7 +23,6 @@ STATION = 12
 DEFECTS, DEFECTS_END, PATCHES, PATCHES_END, ITEMS, ITEMS_END = 13, 14, 15, 16, 17, 18  # row numbers
 FALL_LEFT, FALL_RIGHT, KERB_LEFT, KERB_RIGHT = 19, 21, 23, 25  # columns of falls and kerbs
 HUMPS, HUMPS_END = 27, 28  # columns of humps
-NODE_COLUMNS = 29  # numbers of a node
 
 # Places in the section.
 CROWN, LANES_EDGE, SHOULDER_SLOPE, PAVED_EDGE, VERGE_SLOPE, ROUNDING, SURFACE_EDGE, KERB_FACE = 0, 1, 2, 3, 4, 5, 6, 7

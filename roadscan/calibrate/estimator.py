@@ -243,7 +243,7 @@ class _Adjustment:
         return z, settled
 
     def _again(self, z: Float64, free: Float64 | None) -> tuple[Float64, bool, bool]:
-        """Find the evidence with improved mountings and solve; return whether that converged, and whether they stay."""
+        """Solve with evidence at improved mountings; return z, whether it converged, and whether it changed little."""
         self._find(z)
         found, settled = self._solve(z, free, reject=True)
         return found, settled, self._small(found - z, self._linearised(found, reject=True), share=_STAYED)
@@ -419,7 +419,7 @@ class _System:
         return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
     def cost(self, scales: Scales) -> float:
-        """Return the cost that is minimised, with the weights of another point."""
+        """Return the cost at this point for the scales of weights that another point gave."""
         of_evidence = sum(scales.gain(one.kind) * loss(one, scales, reject=self.reject) for one in self.weighed)
         return float(of_evidence + self.z @ self.z)
 

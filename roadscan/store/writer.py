@@ -67,7 +67,7 @@ def sorted_batch(schema: TableSchema, rows: pa.RecordBatch) -> pa.RecordBatch:
 
 
 def ordered(keys: Sequence[Array]) -> tuple[Int64, list[Array]]:
-    """Return the order (n,) of rows by their keys (n,), the first foremost, and the keys in it; ties stay as they are.
+    """Return the stable order (n,) of rows by their keys (n,), the first key foremost, and the keys in that order.
 
     Where keys and row numbers fit into 64 bits together, such numbers are sorted: that is faster than by key and key.
     """
@@ -141,12 +141,12 @@ def _keys(schema: TableSchema, rows: pa.Table | pa.RecordBatch) -> list[Array]:
 
 
 def _place(column: pa.Array) -> tuple[object, ...]:
-    """Return what the values of an array are read from."""
+    """Return the memory of an array: equal for arrays that share it."""
     return column.type, column.offset, *(buffer and buffer.address for buffer in column.buffers())
 
 
 def _in(order: Int64, values: Array) -> Array:
-    """Return numbers (n,) in an order: the same array where all of them are one whole number."""
+    """Return numbers (n,) in an order; whole numbers that are all equal are returned as they are, without a copy."""
     if values.dtype.kind in "iu" and values[0] == values[-1] and (values == values[0]).all():
         return values
     return np.asarray(values[order])

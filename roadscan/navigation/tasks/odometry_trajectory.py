@@ -231,7 +231,7 @@ _TILT_RAD: Final = np.radians(2.0)  # gravity of a window against that of the dr
 def findings(
     subject: str, way: Way, matched: Matched, windows: Windows | None, config: OdometryConfig, max_gap_s: float
 ) -> Iterator[Finding]:
-    """Yield a finding for each kind of contradiction, with the number of its times and the worst of them."""
+    """Yield a finding for each kind of contradiction: how often it occurs, and when it is worst."""
 
     def told(bad: Bool, at: Int64, size: Float64, words: str, left_out: int = 0) -> Iterator[Finding]:
         if bad.any():

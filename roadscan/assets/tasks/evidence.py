@@ -31,8 +31,8 @@ from roadscan.run.keys import code_digest, key_of
 from roadscan.run.stage import WORKER_BASE_BYTES
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.schema import table_schema
+from roadscan.store.small_tables import parquet_bytes
 from roadscan.store.store import Store
-from roadscan.store.writer import parquet_bytes
 from roadscan.tiles.product import ProductContext, publish_file
 from roadscan.tiles.tasks.tile_plan import Block
 from roadscan.tiles.tasks.tiles import TaskResult

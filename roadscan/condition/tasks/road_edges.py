@@ -36,7 +36,7 @@ from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import bytes_digest, file_digest
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.schema import table_schema
-from roadscan.store.writer import parquet_bytes
+from roadscan.store.small_tables import parquet_bytes
 from roadscan.tiles.cells import read_cells
 from roadscan.tiles.products.geo_table import write_geo_table
 from roadscan.tiles.tasks.tiles import TaskResult

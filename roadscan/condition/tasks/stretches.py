@@ -29,8 +29,8 @@ from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
+from roadscan.store.small_tables import parquet_bytes
 from roadscan.store.store import Store
-from roadscan.store.writer import parquet_bytes
 from roadscan.surface.reconstruction import SurfaceGrid
 from roadscan.surface.settings import SurfaceConfig
 from roadscan.tiles.cells import TileCells, read_cells

@@ -49,8 +49,8 @@ from roadscan.run.keys import code_digest, key_of, name_of
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded, recorded_table
 from roadscan.store.schema import table_schema
+from roadscan.store.small_tables import parquet_bytes
 from roadscan.store.store import Store
-from roadscan.store.writer import parquet_bytes
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.geo_table import read_geo_table
 from roadscan.tiles.tasks.tiles import TaskResult

@@ -42,9 +42,9 @@ from roadscan.navigation.odometry import (
     way_of,
     windows_of,
 )
-from roadscan.navigation.tasks.clock_tables import load_clocks
 from roadscan.navigation.tasks.navigation_logs import chosen, imu_readings, sensor_of
 from roadscan.navigation.tasks.solve_trajectory import Computed, on_time, sigma_figures, trajectory_rows
+from roadscan.navigation.tasks.trajectories import load_clocks
 from roadscan.run.keys import code_digest, key_of, name_of
 from roadscan.store.logs import NAVIGATION, LogRecord
 from roadscan.store.readings.row_groups import read_groups

@@ -33,8 +33,16 @@ from roadscan.formats.vectors.vector_layer import (
 )
 from roadscan.georeference.place import Placement, ProfilePoints
 from roadscan.georeference.plan.plan import SurveyPlan
-from roadscan.georeference.plan.road import looks_across, road_key
-from roadscan.georeference.sources import Georeferencer, MapSettings, RawSlice, ReadingSource, geometry_of, read_rows
+from roadscan.georeference.plan.road import looks_across
+from roadscan.georeference.sources import (
+    Georeferencer,
+    MapSettings,
+    RawSlice,
+    ReadingSource,
+    geometry_of,
+    read_rows,
+    road_key,
+)
 from roadscan.run.engine.compute import Compute, run_bundles
 from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import file_digest

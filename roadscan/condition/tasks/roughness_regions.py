@@ -14,11 +14,10 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.compute.array_types import Float64
-from roadscan.condition.road_line import Lane, RoadLine
+from roadscan.condition.road_line import Lane, RoadLine, Roads
 from roadscan.condition.roughness_rasters import RoadPoints, normalised_intensity
 from roadscan.condition.roughness_regions import Region, SectionRegions, find_regions
 from roadscan.condition.settings import RoughnessRegionsConfig
-from roadscan.condition.tasks.lines import Roads
 from roadscan.condition.tasks.tasks import PieceTask, tiles_beside
 from roadscan.core.canvas import empty_figure
 from roadscan.core.extras import can_draw

@@ -29,18 +29,19 @@ from roadscan.condition.lane_data import (
     edges_on_lane,
     located,
 )
-from roadscan.condition.road_line import Lane, RoadLine
+from roadscan.condition.road_line import Lane, RoadLine, Roads
 from roadscan.condition.settings import SectionConfig
 from roadscan.condition.survey_lane import window_m2
-from roadscan.condition.tasks.lines import Roads
-from roadscan.condition.tasks.road_edges import EDGE_PIECE_M, EDGES, edge_unit
 from roadscan.condition.tasks.stretches import (
     CROSS_SECTIONS,
+    EDGE_PIECE_M,
+    EDGES,
     LANE_LINES,
     LANE_TEXTURE,
     OF_STRETCHES,
     PROFILES,
     STRETCH_M,
+    edge_unit,
     unit_of,
 )
 from roadscan.core.witness import Finding

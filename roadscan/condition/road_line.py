@@ -17,8 +17,6 @@ from roadscan.compute.array_types import Float64
 from roadscan.condition.kernels.road_frame import place
 
 STATION_M: Final = 0.5  # step along the road of what is known by station: edges, cells that show them (m)
-
-
 NODE_M: Final = 1.0
 """Distance between the nodes of a line, and between those of a lane's middle (m)."""
 _ROUNDS: Final = 4

@@ -28,7 +28,7 @@ from roadscan.store.digest import file_digest
 from roadscan.store.logs import DataFile, log_folder
 from roadscan.store.readings.packed_returns import PACKED, as_returns, stored_columns, write_packed_returns
 from roadscan.store.schema import TableSchema, table_schema
-from roadscan.store.small_tables import write_by_arrow
+from roadscan.store.small_tables import parquet_bytes, write_by_arrow  # noqa: F401 — stages elsewhere import it here
 from roadscan.store.store import Store, count_put
 
 _WORD_BITS: Final = 64  # bits of the number that rows are sorted by: key and row number

@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 import scipy.optimize
+from scipy.special import expit, logit
 
 from benchmarks.asset_scores import Judged, calibration_error, judged
 from benchmarks.asset_streets import motorway, processed, town
@@ -52,6 +53,11 @@ def figures(folder: Path) -> Iterator[Figure]:
         yield Figure(f"{group}: slope", curve.slope, "", CURVES[group].slope, "in force")
 
 
+def of_evidence(curve: Curve, stated: float) -> float:
+    """Return the evidence's probability for the stated one."""
+    return float(expit((logit(stated) - curve.offset) / curve.slope))
+
+
 def judged_streets(seeds: Iterable[int], folder: Path) -> list[Judged]:
     """Objects of drawn streets."""
     found: list[Judged] = []
@@ -65,7 +71,7 @@ def fitted(objects: Sequence[Judged]) -> dict[str, Curve]:
     curves = {}
     for group in CURVES:
         own = [o for o in objects if asset_kinds()[o.kind].curve == group]
-        evidence = np.array([CURVES[group].of_evidence(o.probability) for o in own])
+        evidence = np.array([of_evidence(CURVES[group], o.probability) for o in own])
         odds, right = np.log(evidence / (1.0 - evidence)), np.array([o.is_right for o in own], np.float64)
 
         def loss(line: npt.NDArray[np.float64], odds: object = odds, right: object = right) -> float:

@@ -18,11 +18,10 @@ import numpy as np
 import numpy.typing as npt
 
 from benchmarks.timing import Figure
-from roadscan.core.grid import Bounds, TileGrid
 from roadscan.core.rig import ScanGeometry
 from roadscan.core.settings.segmentation import SegmentationConfig
 from roadscan.georeference.road_profiles import segmented
-from roadscan.surface.regions import CoarseModel, CoarseSettings, RegionSettings, Stretch, coarse_model, find_regions
+from roadscan.surface.regions import CoarseSettings, RegionSettings, Stretch, coarse_model, find_regions
 
 LENGTH_M, SPEED_M_PER_S = 1000.0, 50.0 / 3.6
 PIECE_M = 100.0
@@ -48,17 +47,15 @@ def figures(folder: Path) -> Iterator[Figure]:
 
 def _measured(name: str, course: _Course, step_m: float) -> Generator[Figure, None, float]:
     """Seconds a kilometre of each step, and the factor of all; returns profiles a second."""
-    settings, grid = CoarseSettings(), TileGrid(10.0, 0.05)
+    settings = CoarseSettings()
     classes, first = _best(lambda: segmented(course.ranges, course.geometry, SegmentationConfig()))
     stretch, second = _best(lambda: course.stretch(classes))
     model, third = _best(lambda: coarse_model(stretch, settings))
     found, fourth = _best(lambda: find_regions(model, RegionSettings()))
-    tiles = grid.tiles_in(_box(model))
-    _, fifth = _best(lambda: [model.tile_cells(tile, grid) for tile in tiles])
     per_km = LENGTH_M / PIECE_M
     steps = {
         "segmentation": first, "profiles as lines on the map": second, "splines and median": third,
-        "regions of interest": fourth, "cells of tiles, 5 cm": fifth,
+        "regions of interest": fourth,
     }  # fmt: skip
     for what, seconds in steps.items():
         yield Figure(f"{name}: {what}, a km", seconds * per_km, "s")
@@ -69,14 +66,8 @@ def _measured(name: str, course: _Course, step_m: float) -> Generator[Figure, No
     yield Figure(f"{name}: others rejected", 100.0 * float((classes != 0)[others].mean()), "%", 97.0, "bar")
     yield Figure(f"{name}: regions found of {course.potholes} potholes", len(found), "")
     yield Figure(f"{name}: coarse model, real-time factor", drive_s / coarse, "", 100.0, "bar for the SICK")
-    yield Figure(f"{name}: with regions and cells, real-time factor", drive_s / sum(steps.values()), "")
+    yield Figure(f"{name}: with regions, real-time factor", drive_s / sum(steps.values()), "")
     return len(course.ranges) / coarse
-
-
-def _box(model: CoarseModel) -> Bounds:
-    """The ground that a model covers."""
-    ends = np.concatenate([model.zero_m + t * model.right for t in (model.across_m[0], model.across_m[-1])])
-    return Bounds(*ends.min(axis=0).tolist(), *ends.max(axis=0).tolist())
 
 
 def _best(function: Callable[[], T], runs: int = 5) -> tuple[T, float]:

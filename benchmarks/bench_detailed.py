@@ -19,10 +19,11 @@ from benchmarks.timing import Figure, in_turns, thread_seconds
 from roadscan.core.grid import Bounds
 from roadscan.surface.clough_tocher import cubic_surface
 from roadscan.surface.normals import slopes_at
-from roadscan.surface.reconstruction import DetailedSettings, detailed_surface
+from roadscan.surface.reconstruction import DetailedSettings
 from roadscan.surface.sites import sites
 from roadscan.surface.tile import GridWindow
 from roadscan.surface.triangulation import triangulate
+from tests.surface.detailed_surface import detailed_surface
 from tests.surface.test_detailed import franke
 
 ORIGIN = np.array([431_000.0, 5_400_000.0, 0.0])

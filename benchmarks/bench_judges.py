@@ -17,13 +17,13 @@ from benchmarks.edge_scenes import LOWEST_M, simulated_kerbs
 from benchmarks.hard_streets import hard_street
 from benchmarks.judged_scenes import PERSON, UNKNOWN, VEHICLE, JudgedScene, simulated
 from benchmarks.labelled_returns import LabelledReturns, labelled_returns
+from benchmarks.street_classes import kerb_heights
 from benchmarks.street_scores import points_along, share_within
 from benchmarks.timing import Figure
 from roadscan.assets import classes
 from roadscan.assets.edges.steps import raster_of
 from roadscan.assets.kinds.kerb import Kerb, KerbOptions
 from roadscan.simulate import Scene as Street
-from roadscan.simulate.kernels.ground import kerb_heights
 
 UNSEEN: Final = range(900, 908)
 """Seeds of the streets."""

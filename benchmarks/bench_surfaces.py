@@ -27,8 +27,8 @@ from benchmarks.timing import Figure
 from roadscan.calibrate.estimator import Calibration, calibrate
 from roadscan.calibrate.evidence import Evidence, Orientation
 from roadscan.calibrate.surfaces.heights import HeightTies
-from roadscan.calibrate.surfaces.objects import HeadTies, agreement
-from roadscan.calibrate.surfaces.planes import PlaneTies, level_from_world, placed
+from roadscan.calibrate.surfaces.objects import HeadTies, cell_heights
+from roadscan.calibrate.surfaces.planes import Placed, PlaneTies, level_from_world, placed
 from roadscan.calibrate.unknowns import Estimate
 from roadscan.core.settings.calibration import CalibrationSettings
 
@@ -44,6 +44,10 @@ TACTICAL = "2 mm, 0.0015°"
 AXES = ("forward", "right", "down", "roll", "pitch", "heading")
 _SCALE = np.repeat([1e3, np.degrees(1.0)], 3)
 """To mm and degrees."""
+_CELL_M, _LEAST_READINGS = 0.01, 4
+"""Edge of a cell in which heights are compared (m), and readings of each head in it."""
+_EVEN = 4.0
+"""Cells with a variance above this multiple of the usual one lie on an edge."""
 
 Solve = Callable[[int], tuple[Yard, Calibration]]
 
@@ -138,4 +142,17 @@ def overlap_mm(yard: Yard, found: Calibration) -> float:
     by_drive: dict[str, list] = {}
     for one in at:
         by_drive.setdefault(one.readings.drive, []).append(one)
-    return 1e3 * float(np.sqrt(np.mean([agreement(a, b).beyond_noise_m ** 2 for a, b in by_drive.values()])))
+    return 1e3 * float(np.sqrt(np.mean([_beyond_noise_m2(a, b) for a, b in by_drive.values()])))
+
+
+def _beyond_noise_m2(first: Placed, second: Placed) -> float:
+    """Mean squared difference (m²) of two heads in cells that both see, less the scatter of the readings within them.
+
+    Cells across an edge have no one height and are left out: those whose readings scatter far more than usual.
+    """
+    near, other = (cell_heights(one.place_m, _CELL_M, _LEAST_READINGS) for one in (first, second))
+    _, a, b = np.intersect1d(near.key, other.key, assume_unique=True, return_indices=True)
+    noise = near.variance_m2[a] + other.variance_m2[b]
+    even = noise <= _EVEN * np.median(noise)
+    away = (near.height_m[a] - other.height_m[b])[even]
+    return max(float(np.mean(away**2)) - float(noise[even].mean()), 0.0)

@@ -22,11 +22,11 @@ from benchmarks.hard_streets import SCANNERS, hard_street
 from benchmarks.labelled_returns import CLASSES, labelled_returns
 from benchmarks.labelled_scenes import labelled_scenes
 from benchmarks.labelled_street import LabelledStreet, read_street, recording_folder
+from benchmarks.street_classes import kerb_heights
 from roadscan.assets.intensity import calibrated_scene, gains_of, intensity_sample
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.scene import Box, Scene
 from roadscan.simulate import Scene as Street
-from roadscan.simulate.kernels.ground import kerb_heights
 from roadscan.simulate.surface import Surface
 
 Float64 = npt.NDArray[np.float64]

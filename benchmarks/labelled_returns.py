@@ -24,15 +24,15 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
+from benchmarks.street_classes import class_of_kind, find_paint, kerb_heights
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.scene import Box, Returns
 from roadscan.assets.scene import Scene as AssetScene
 from roadscan.simulate import Scene
-from roadscan.simulate.bodies import CLASSES, class_number, class_of_kind
+from roadscan.simulate.bodies import CLASSES, class_number
 from roadscan.simulate.caster import World
 from roadscan.simulate.drive import Drive, Poses, drives_of
-from roadscan.simulate.kernels.ground import kerb_heights
-from roadscan.simulate.kernels.road import KERB_TOP_M, find_paint
+from roadscan.simulate.kernels.road import KERB_TOP_M
 from roadscan.simulate.path import Earth, LocalMap
 from roadscan.simulate.sensors.lidar import BODY_FROM_AXES, Packets, beam_width_deg, measure
 from roadscan.simulate.surface import Surface

@@ -39,8 +39,8 @@ from roadscan.store.logs import log_of, read_log_records, write_log_record
 from roadscan.store.manifest import OutputRecord
 from roadscan.store.records import Row
 from roadscan.store.schema import table_schema
+from roadscan.store.small_tables import parquet_bytes
 from roadscan.store.store import Store
-from roadscan.store.writer import parquet_bytes
 from roadscan.strips.work import PRODUCT as STRIPS
 from roadscan.strips.work import StripTask
 from roadscan.survey.run import run_stages

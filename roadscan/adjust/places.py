@@ -167,7 +167,7 @@ def _visits(samples: Samples, limits: Limits, step_m: float) -> Visits:
 
 
 def _between(samples: Samples, found: Visits, number: Int64, every: int, return_s: float) -> Bool:
-    """Returns samples (n,) that lead as well, because a visit, such as a crossing, lies between the even leads.
+    """Returns a mask (n,) of samples that lead in addition: a visit, such as a crossing, lies between the even leads.
 
     A visit goes on from sample to sample of the lead. Of one that no even lead within `every` samples meets, the middle
     sample leads.

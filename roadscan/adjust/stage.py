@@ -9,7 +9,9 @@ from roadscan.adjust.settings import AdjustConfig
 from roadscan.adjust.tasks.adjustment import adjust_survey, is_current, solution_key, why_due, withdraw
 from roadscan.adjust.tasks.control_work import read_picked
 from roadscan.adjust.tasks.hand_ties import read_hand_ties
+from roadscan.adjust.tasks.near import memory_of
 from roadscan.adjust.tasks.outcome import FOLDER, TABLES, known_findings, known_lines
+from roadscan.adjust.tasks.tracks import adjusted_sources
 from roadscan.core.errors import ConfigError, RoadscanError
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding
@@ -79,6 +81,7 @@ class Adjust(Stage):
             why=Counter([why] if why else []),
             keys=[solution_key(plan, session.manifest)] if asked else [],
             notes=notes,
+            worker_memory_bytes=memory_of(adjusted_sources(plan)) if why and asked else None,
             lines=known_lines(session.manifest),
         )
 

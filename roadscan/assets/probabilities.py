@@ -20,10 +20,6 @@ class Curve(NamedTuple):
         """Returns the stated probability for the evidence's `probability`."""
         return _of_odds(self.offset + self.slope * _odds(probability))
 
-    def of_evidence(self, stated: float) -> float:
-        """Returns the evidence's probability for the stated one."""
-        return _of_odds((_odds(stated) - self.offset) / self.slope)
-
 
 CURVES: Final = {
     "surfaces": Curve(-0.07, 0.48),

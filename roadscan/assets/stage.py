@@ -205,7 +205,7 @@ class Assets(Stage):
         """Outputs of squares, objects and files that exist, and those that are due as far as is known by now."""
         if not session.survey.has("assets"):
             return StageState()
-        from roadscan.assets.tasks.evidence import EVIDENCE, evidence_tasks
+        from roadscan.assets.tasks.evidence import EVIDENCE, evidence_tasks, memory_of
         from roadscan.assets.tasks.gains import current_gains
         from roadscan.assets.tasks.objects import OBJECTS
         from roadscan.assets.tasks.tables import TABLES
@@ -224,6 +224,7 @@ class Assets(Stage):
         state = StageState(current, stale)
         if work.squares:
             state.tasks, state.raw_bytes = len(tasks), sum(t.load.readings.raw_bytes for t in tasks)
+            state.worker_memory_bytes = memory_of(plan, tasks)
         return state
 
     def _files_due(self, session: Session, plan: AssetPlan) -> int:

@@ -36,11 +36,6 @@ class Cubes:
     features: npt.NDArray[np.float32]
     """(cubes, 7), columns as in :mod:`roadscan.assets.kernels.cubes`."""
 
-    def of_returns(self, column: int, otherwise: float = np.nan) -> npt.NDArray[np.float32]:
-        """Returns a feature (n,) of each return's cube."""
-        values = np.append(self.features[:, column], np.float32(otherwise))
-        return np.asarray(values[self.number])
-
 
 def cubes_of(returns: Returns, above_m: npt.NDArray[np.float32], chosen: Bool, window: Box) -> Cubes:
     """Returns the cubes of the chosen returns (n,), with the scatter in each cube and its neighbours."""

@@ -131,8 +131,6 @@ class Calibration:
     figures: tuple[Figures, ...]
     corrections: dict[int, Correction]
     """Errors of the poses, by traverse."""
-    correction_sigma: dict[int, Float64]
-    """(6,) 1 σ of them, m and rad."""
     objects: dict[str, ObjectPose]
     rounds: int
     """Number of times that the evidence was searched for."""
@@ -245,7 +243,7 @@ class _Adjustment:
         return z, settled
 
     def _again(self, z: Float64, free: Float64 | None) -> tuple[Float64, bool, bool]:
-        """Find the evidence with improved mountings and solve; return whether that converged, and whether they stay."""
+        """Solve with evidence at improved mountings; return z, whether it converged, and whether it changed little."""
         self._find(z)
         found, settled = self._solve(z, free, reject=True)
         return found, settled, self._small(found - z, self._linearised(found, reject=True), share=_STAYED)
@@ -297,7 +295,6 @@ class _Adjustment:
         change = system.now.derivative[:size, :size]
         covariance = change @ seen.covariance @ change.T
         keep = np.concatenate([MOUNTING * i + np.arange(6) for i in range(len(self.unknowns.priors))])
-        spread = np.sqrt(np.diag(self.unknowns.root @ system.covariance @ self.unknowns.root.T))
         return Calibration(
             sensors={name: self._calibrated(name, estimate, covariance, seen) for name in self.unknowns.priors},
             covariance=covariance[np.ix_(keep, keep)],
@@ -305,9 +302,6 @@ class _Adjustment:
             kinds=system.kind_figures(),
             figures=_figures(system.weighed, before),
             corrections=estimate.corrections,
-            correction_sigma={
-                int(key): spread[self.unknowns.body_slice(body)] for body, key in enumerate(self.unknowns.traverse_keys)
-            },
             objects=estimate.objects,
             rounds=self.rounds,
             iterations=self.iterations,
@@ -425,7 +419,7 @@ class _System:
         return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T)
 
     def cost(self, scales: Scales) -> float:
-        """Return the cost that is minimised, with the weights of another point."""
+        """Return the cost at this point for the scales of weights that another point gave."""
         of_evidence = sum(scales.gain(one.kind) * loss(one, scales, reject=self.reject) for one in self.weighed)
         return float(of_evidence + self.z @ self.z)
 

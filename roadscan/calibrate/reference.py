@@ -123,11 +123,6 @@ class Registration:
     fates: dict[str, int]
     """Counts of readings by outcome: tied, near, no_plane, grazing, outlier, changed (the surface moved), spare."""
 
-    @property
-    def rms_m(self) -> float:
-        """RMS of the ties' residuals."""
-        return float(np.sqrt((self.residual_m**2).mean()))
-
 
 def register(
     scan: Seen, reference_m: Float64, start: Mounting, options: ReferenceOptions | None = None

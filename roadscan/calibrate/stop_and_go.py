@@ -95,10 +95,6 @@ class HeadOrientation:
     """(3, 3) of a small rotation about the body's axes that follows `body_from_imu`."""
     correction_rad: Float64
     """(3,) from the nominal orientation to this one."""
-    force_residual_m_per_s2: Float64
-    """(3,) root mean square of the windows, body axes, with all errors estimated."""
-    turn_residual_rad: Float64
-    """(3,)"""
     windows: int
     """Number of windows of forces."""
     standing: int
@@ -107,8 +103,6 @@ class HeadOrientation:
     """Delay of the stamps of the head's IMU, by run (pieces of long ones)."""
     accelerometer_bias_m_per_s2: Float64
     """(runs or pieces, 3) mean over each, IMU axes."""
-    gyroscope_bias_rad_per_s: Float64
-    """(runs or pieces, 3)"""
     attitude: tuple[AttitudeInfluence, ...] = ()
     """By run or piece: the part of the error that comes from the trajectory, which other heads share."""
 
@@ -527,17 +521,9 @@ def _result(runs: Sequence[_Run], rotation: Float64, nominal: Mounting, solution
         body_from_imu=rotation,
         covariance_rad2=solution.covariance,
         correction_rad=correction,
-        force_residual_m_per_s2=_rms(solution.force),
-        turn_residual_rad=_rms(solution.turn),
         windows=sum(run.count for run in runs),
         standing=sum(int((run.speed < _STANDING_M_PER_S).sum()) for run in runs),
         late_s=tuple(float(own[-1]) for own in solution.own),
         accelerometer_bias_m_per_s2=np.array([s[:3] for s in slow]),
-        gyroscope_bias_rad_per_s=np.array([s[3:6] for s in slow]),
         attitude=tuple(run.attitude_influence(by) for run, by in zip(runs, solution.influence, strict=True)),
     )
-
-
-def _rms(residuals: Sequence[Float64]) -> Float64:
-    whole = np.concatenate(residuals)
-    return np.sqrt(np.mean(whole**2, axis=0)) if whole.size else np.zeros(3)

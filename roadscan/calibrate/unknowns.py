@@ -206,7 +206,7 @@ class Unknowns:
 
     @cached_property
     def root(self) -> Float64:
-        """(P, P) with root · rootᵀ the prior covariance: metres and radians; shifts of traverses north, east, down."""
+        """Return a root (P, P) of the prior covariance, root · rootᵀ (m, rad); traverses shift north, east, down."""
         root = np.zeros((self.size, self.size))
         for name, prior in self.priors.items():
             sigma = [*prior.lever_arm_sigma_m, *prior.boresight_sigma_rad, prior.range_offset_sigma_m]

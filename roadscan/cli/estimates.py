@@ -11,7 +11,7 @@ from roadscan.cli.terminal import print_table
 
 def clocks(survey_file: SurveyFile) -> None:
     """Clocks of sensors as they were estimated; estimates those that are missing or out of date."""
-    from roadscan.navigation.tasks.clock_tables import kept_estimates
+    from roadscan.navigation.tasks.trajectories import kept_estimates
 
     run = run_survey(survey_file, ["navigate"], Where(0))
     rows = [

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.array_types import Float32, Float64, Int64
+from roadscan.compute.arrays import SIGMA_OF_MAD
 
 CELL_M: Final = 0.5
 """Edge of the cubes (m) in which pictures are compared; they are anchored at the map's origin and at height 0."""
@@ -94,7 +95,7 @@ def _pairs(samples: list[PictureSample]) -> tuple[Int64, Int64, Float64, Float64
                 continue
             ratios = np.log(one.colour[here].astype(np.float64) / samples[j].colour[there])
             middle = np.median(ratios, axis=0)
-            spread = 1.4826 * float(np.median(np.abs(ratios - middle)))
+            spread = SIGMA_OF_MAD * float(np.median(np.abs(ratios - middle)))
             found.append((i, j, middle, float(np.hypot(_PAIR, spread) / np.sqrt(here.size))))
             met += 1
             if met == _NEIGHBOURS:

@@ -10,10 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.array_types import Float64
-from roadscan.condition.road_line import RoadLine
+from roadscan.condition.road_line import STATION_M, RoadLine
 from roadscan.tiles.cells import TileCells
 
-STATION_M: Final = 0.5  # Extent of a cell along the road.
 OFFSET_M: Final = 0.1
 """Extent of a cell across the road."""
 TALLEST_M: Final = 0.5

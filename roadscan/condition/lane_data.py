@@ -14,7 +14,6 @@ import shapely
 
 from roadscan.compute.array_types import Float64
 from roadscan.compute.edges import painted_line, without_lines
-from roadscan.condition.edge_raster import STATION_M
 from roadscan.condition.kernels.lane_texture import (
     FIGURES,
     INTENSITY,
@@ -28,7 +27,7 @@ from roadscan.condition.kernels.lane_texture import (
     texture_of_squares,
 )
 from roadscan.condition.kernels.sampling import CellTable, mean_intensities
-from roadscan.condition.road_line import Lane, RoadLine
+from roadscan.condition.road_line import STATION_M, Lane, RoadLine
 from roadscan.condition.settings import SectionConfig
 
 PIECE_M: Final = 0.05

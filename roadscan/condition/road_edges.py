@@ -23,8 +23,8 @@ import shapely
 from roadscan.compute.array_types import Bool, Float64
 from roadscan.compute.arrays import SIGMA_OF_MAD, runs_of
 from roadscan.compute.edges import DEFAULT, PAINT, AcrossSettings, counted, evidence_across, path_along, without_lines
-from roadscan.condition.edge_raster import OFFSET_M, STATION_M, SideRaster, TilePoints, ground_points, side_raster
-from roadscan.condition.road_line import Lane, RoadLine
+from roadscan.condition.edge_raster import OFFSET_M, SideRaster, TilePoints, ground_points, side_raster
+from roadscan.condition.road_line import STATION_M, Lane, RoadLine
 
 KINDS: Final = ("kerb", "drop", "slope", "intensity", "marking", "polygon")
 """Evidence of an edge: a step up, a step down, a change of slope, one of intensity, a painted line, a polygon."""

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from roadscan.compute.array_types import Float64
 from roadscan.condition.kernels.road_frame import place
 
+STATION_M: Final = 0.5  # step along the road of what is known by station: edges, cells that show them (m)
 NODE_M: Final = 1.0
 """Distance between the nodes of a line, and between those of a lane's middle (m)."""
 _ROUNDS: Final = 4
@@ -138,3 +139,12 @@ class Lane:
             self.road, self.name, self.sign, self.first_m + first, self.offset_m[first:end], self.width_m,
             self.width_from, self.passes, self.sigma_roll_deg, self.sigma_height_m, self.wander_m2_per_m,
         )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Roads:
+    """Lines and lanes from the store."""
+
+    lines: dict[str, RoadLine]
+    """Lines by road."""
+    lanes: tuple[Lane, ...]

@@ -330,7 +330,7 @@ class Cluster:
 def clusters_of(
     raster: IntensityRaster, dim_below: int, least_area_m2: float, among: Sequence[Cluster] | None = None
 ) -> tuple[list[Cluster], int]:
-    """Return clusters of cells up to an 8-bit value, from the first row on, and the number of those below an area.
+    """Return the clusters of dim cells that reach an area, by their first row, and how many smaller ones there are.
 
     among : clusters; only their cells are used.
     """

@@ -77,7 +77,7 @@ class WheelPath:
         return np.concatenate([height, height + errors + self.wander() + self.moved_walls(first_stream)])
 
     def moved_walls(self, first_stream: int = 0) -> Float64:
-        """(12, n) changes of the heights (m) where walls stand elsewhere between the heights that they separate."""
+        """Return (12, n) changes of the heights (m) by drawing the place of each wall between its two heights."""
         added = np.zeros((NOISES, self.profile.height_m.size))
         if not self.walls:
             return added
@@ -101,7 +101,7 @@ class WheelPath:
         return np.cumsum(math.sqrt(self.wander_m2_per_m * self.spacing_m) * drawn, axis=1)
 
     def tried(self, first_stream: int = 0) -> Float64:
-        """Return (2 + 2 · 12, n) sharpened: heights, heights less so, heights with all errors, and noise alone."""
+        """Return (2 + 2 · 12, n) sharpened heights: measured, with one round less, with all errors; and noise alone."""
         noisy = self.with_noise(first_stream)
         alone = noise(self.profile, self.spacing_m, self.cell_m, first_stream)
         once = self.sharpened(noisy[:1], _ROUNDS - 1)
@@ -362,7 +362,7 @@ class WholeSections:
 
     @classmethod
     def of(cls, lane: LaneData) -> WholeSections:
-        """Select those that are not noisy, with at least `least_share` measured, also of both ends, but for a tenth."""
+        """Return the sections that are not noisy, measured by `least_share`, and known in both outer tenths."""
         c = lane.cross_sections
         known = ~np.isnan(c.height_m)
         m = c.offset_m.size

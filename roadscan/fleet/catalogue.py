@@ -89,7 +89,7 @@ def read_catalogue(place: str) -> pa.Table | None:
 
 
 def doubled(found: list[Found], one: Found) -> list[str]:
-    """Return a note where other surveys have the same id: rows of a question to all would not tell them apart."""
+    """Return a note where other surveys have the same id: a query over all surveys cannot tell their rows apart."""
     same = Counter(other.id for other in found if other.store is not None)
     if one.store is None or same[one.id] < 2:
         return []

@@ -30,8 +30,8 @@ from roadscan.run.stage import StageState
 from roadscan.store.digest import bytes_digest, sealed_parquet
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
+from roadscan.store.small_tables import parquet_bytes
 from roadscan.store.store import Store
-from roadscan.store.writer import parquet_bytes
 
 PRODUCT = "footprints"
 

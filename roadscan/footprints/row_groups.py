@@ -104,7 +104,7 @@ class GroupsByTile:
 
     @cached_property
     def _owned(self) -> tuple[Int64, Int64, Int64]:
-        """First and end of the groups that each tile reports on, and where a tile's ranges begin (tiles + 1,)."""
+        """Return first and end of the groups that each tile reports on, and where its ranges begin (tiles + 1,)."""
         tiles = self._starts.size - 1
         edges = np.sort(np.concatenate([self._begin, self._end]))
         edges = edges[np.diff(edges, prepend=-1) != 0]

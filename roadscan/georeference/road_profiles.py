@@ -179,7 +179,7 @@ def _limits(
 
 
 def _steps(poses: Poses, lever_arm_body_m: tuple[float, float, float]) -> tuple[Int64, Int64]:
-    """Return steps (k − 1,) of a sensor along the body (nm) and turns to the right (nrad), 0 beside no pose.
+    """Return steps (k − 1,) of a sensor along the body (nm) and turns to the right (nrad); 0 where a pose is missing.
 
     Written out by element: sums of a library may depend on how many there are.
     """
@@ -246,7 +246,7 @@ def segmented(
 
 
 def _numbers(s: SegmentationConfig) -> tuple[float, ...]:
-    """Return the settings in the order of ``georeference.kernels.carriageway.SETTINGS``."""
+    """Return the settings in the order of ``georeference.kernels.segmentation.SETTINGS``."""
     return (
         s.bin_m, s.share, s.gate_m, s.scatter_factor, float(s.scatter_readings), math.radians(s.grazing_deg),
         s.chord_m, s.step_m, s.noise_factor, s.slope, s.window_m, float(s.window_readings), s.bridge_m,
@@ -312,7 +312,7 @@ class RoadProfiles:
 
     @classmethod
     def of(cls, ranges: UInt16, classes: UInt8) -> RoadProfiles:
-        """Set the readings (n, m) to 0 that `classes` names."""
+        """Return the profiles with 0 for each reading (n, m) that `classes` says is not road."""
         road, counts = np.array(ranges, order="C"), np.zeros(len(NOT_ROAD), np.int64)
         keep_road(classes.reshape(-1), _FIRST, road.reshape(-1), counts)
         return cls(road, classes, counts)
@@ -323,7 +323,7 @@ class RoadProfiles:
         fates[-len(NOT_ROAD) :] += self.counts
 
     def mark(self, classes: UInt8) -> None:
-        """Write the classes of readings set to 0 into the classes (n · m,) that a kernel wrote, by profile."""
+        """Overwrite a kernel's classes (n · m,), profile by profile, with those of the readings that were set to 0."""
         own = self.classes.reshape(-1)
         np.copyto(classes, own, where=own >= _FIRST)
 

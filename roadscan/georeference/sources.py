@@ -1,4 +1,4 @@
-"""Loads raw readings and what georeferences them, for one span of time at once."""
+"""Loads raw readings and what georeferences them, for one span of time at once; the centre lines that limit them."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import functools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -349,3 +350,24 @@ def farthest_m(batch: pa.RecordBatch, geometry: ScanGeometry | None) -> float:
     across = max(abs(geometry.first), abs(geometry.first + geometry.step * (geometry.readings - 1)))
     along = geometry.range_offset_m + geometry.range_step_m * raw
     return float(np.hypot(along, across if geometry.kind == "cartesian" else 0.0))
+
+
+@dataclass(frozen=True)
+class CentreLines:
+    """The centre-line layer and the distances kept beside its lines. Sent to workers: it holds no data."""
+
+    path: Path
+    digests: tuple[str, ...]
+    """Digests of the layer's files, so that a changed layer counts as another one."""
+    crs: str | None
+    width: str
+    """"buffer", "class", or the attribute with the road's width."""
+    buffer_m: float
+    margin_m: float
+    options: str
+    """Settings of the layer (JSON of ``RoadLinesOptions``)."""
+
+
+def road_key(source: ReadingSource) -> list[object]:
+    """Return the key by which tiles become stale when a source's segmentation changes; empty where it has none."""
+    return [] if source.road is None else [source.road.model_dump(mode="json", exclude={"sensors"})]

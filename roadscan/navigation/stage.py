@@ -15,11 +15,11 @@ from roadscan.core.witness import Finding
 from roadscan.ingest.ingest import survey_records
 from roadscan.ingest.planned_logs import logs_of
 from roadscan.navigation.ppk_picture import COLUMNS, PpkPicture, draw_ppk
-from roadscan.navigation.tasks.clock_tables import set_damaged_clocks_aside
 from roadscan.navigation.tasks.clocks import estimate_clocks
 from roadscan.navigation.tasks.navigate import navigate, records_of
 from roadscan.navigation.tasks.navigation_status import navigation_status, trajectory_findings
 from roadscan.navigation.tasks.recorded_pictures import keep_file, remove_others
+from roadscan.navigation.tasks.trajectories import set_damaged_clocks_aside
 from roadscan.run.keys import code_digest, key_of
 from roadscan.run.session import Session, manifest_of
 from roadscan.run.stage import Stage, StageState

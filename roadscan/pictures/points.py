@@ -15,7 +15,7 @@ import pyarrow.csv as pa_csv
 from roadscan.core.errors import ConfigError, RunError
 from roadscan.core.rig import Rig
 from roadscan.core.rig_text import replace_file
-from roadscan.formats.vectors.picture_points import BY_HAND, FOUND
+from roadscan.formats.vectors.control import BY_HAND, FOUND
 from roadscan.navigation.tasks.recorded_pictures import taken_pictures
 from roadscan.store.logs import LogRecord
 from roadscan.store.readings.row_groups import read_groups

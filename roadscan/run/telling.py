@@ -255,7 +255,7 @@ class Teller:
             )
 
     def _total(self, own: Cost) -> dict[str, Any]:
-        """Return what the stage cost, `own` being what the run's process did: its tasks in there are part of that."""
+        """Return the cost of the stage; that of the run's process (`own`) contains the tasks that ran in it."""
         me = (own.host, own.process)
         all_costs = [own, *(one for one in self._costs if (one.host, one.process) != me)]
         read = [one.bytes_read for one in all_costs]

@@ -91,11 +91,6 @@ class Surface:
         shape = np.broadcast_shapes(np.shape(easting_m), np.shape(northing_m))
         return self._survey(easting_m, northing_m)[:, 4].reshape(shape)
 
-    def defect_depth_m(self, easting_m: npt.ArrayLike, northing_m: npt.ArrayLike) -> Float64:
-        """Return the depth of the pothole, crack or joint at map points (any shape, m); 0 where there is none."""
-        shape = np.broadcast_shapes(np.shape(easting_m), np.shape(northing_m))
-        return self._survey(easting_m, northing_m)[:, 3].reshape(shape)
-
     def station_offset_m(self, easting_m: npt.ArrayLike, northing_m: npt.ArrayLike) -> tuple[Float64, Float64]:
         """Return station and offset (right positive) of map points (any shape, m)."""
         shape = np.broadcast_shapes(np.shape(easting_m), np.shape(northing_m))

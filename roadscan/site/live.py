@@ -93,7 +93,7 @@ class LiveSite:
 def open_survey(
     survey_file: str | Path, over: Sequence[str | Path] = (), *, edited: bool = False
 ) -> Callable[[], Material]:
-    """Return a function that reads a survey anew, with others over it; damaged records are skipped.
+    """Return a function that reads a survey, and those shown over it, at each call; damaged records are skipped.
 
     Parameters
     ----------

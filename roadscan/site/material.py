@@ -82,7 +82,7 @@ class Material:
 
     @cached_property
     def others(self) -> tuple[Material, ...]:
-        """Those surveys.
+        """The surveys that are shown over this one.
 
         Raises
         ------

@@ -181,7 +181,7 @@ def at_once(fs: Any) -> dict[str, int]:
 
 
 def others_write() -> None:
-    """Note that workers may write files from now on which are not told here at once."""
+    """Note that from now on workers may write files of which this process learns later."""
     for look in _LOOKS.values():
         look.is_whole = False
 
@@ -311,7 +311,7 @@ _EXCHANGE: Final = 2
 
 
 def beside(place: Path) -> Path:
-    """Return a new name beside a file or folder; what processes that are dead left under such names is removed."""
+    """Return a new name beside a file or folder; remove what dead processes left under such names."""
     start = f".{place.name}-"
     for left in place.parent.iterdir() if place.parent.is_dir() else ():
         tag = left.name.removeprefix(start)

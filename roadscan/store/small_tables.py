@@ -1,4 +1,4 @@
-"""Reads and writes small tables as whole files: the estimated clocks, mountings and trajectories.
+"""Reads and writes small tables as whole files: the estimated clocks, mountings and trajectories; bytes of others.
 
 No record of the manifest names them, and no run makes all of them. So each one itself says how to repair it. A list of
 their digests (``manifest/held.json``) reveals damage that the checksums of pages do not cover whenever one is read;
@@ -8,6 +8,7 @@ it lists no table that someone put there and roadscan did not write.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any, Final
 
 import pyarrow as pa
@@ -15,7 +16,7 @@ import pyarrow.parquet as pq
 
 from roadscan.core.errors import DamagedError, StoreError
 from roadscan.store.digest import bytes_digest, checked_json, parse_checked
-from roadscan.store.schema import table_schema
+from roadscan.store.schema import TableSchema, table_schema
 from roadscan.store.store import Store
 
 _DIGESTS: Final = "manifest/held.json"
@@ -128,3 +129,39 @@ def _listed(store: Store) -> dict[str, Any]:
         return {}
     parsed = parse_checked(store.read_bytes(_DIGESTS))
     return {name: of for name, of in parsed.items() if name in REPAIR_HINT and dict(of)}
+
+
+def parquet_bytes(rows: pa.Table, schema: TableSchema) -> bytes:
+    """Return the content of a small file of rows without lists of readings, as :func:`write_parquet` writes them."""
+    stream = pa.BufferOutputStream()
+    write_by_arrow(stream, rows, schema)
+    content: bytes = stream.getvalue().to_pybytes()
+    return content
+
+
+def write_by_arrow(to: Path | pa.NativeFile, rows: pa.Table, schema: TableSchema) -> None:
+    """Write rows with pyarrow, each column in the encoding that measured best for its kind."""
+    encodings: dict[str, str] = {}
+    strings: list[str] = []
+    for column in schema.columns:
+        leaf = f"{column.name}.list.element" if column.is_list else column.name
+        kind = column.type[5:-1] if column.is_list else column.type
+        if kind == "string":
+            strings.append(leaf)
+        elif column.encoding:
+            encodings[leaf] = column.encoding
+        elif kind.startswith("float"):
+            encodings[leaf] = "BYTE_STREAM_SPLIT"
+        elif kind != "uint8" and not column.variable:
+            encodings[leaf] = "DELTA_BINARY_PACKED"
+    pq.write_table(
+        rows,
+        to,
+        row_group_size=schema.row_group_rows,
+        compression=schema.compression,
+        compression_level=1 if schema.compression == "zstd" else None,
+        use_dictionary=strings,
+        column_encoding=encodings,
+        write_statistics=[c.name for c in schema.columns if not c.is_list],
+        write_page_checksum=True,
+    )

@@ -28,6 +28,7 @@ from roadscan.store.digest import file_digest
 from roadscan.store.logs import DataFile, log_folder
 from roadscan.store.readings.packed_returns import PACKED, as_returns, stored_columns, write_packed_returns
 from roadscan.store.schema import TableSchema, table_schema
+from roadscan.store.small_tables import parquet_bytes, write_by_arrow  # noqa: F401 — stages elsewhere import it here
 from roadscan.store.store import Store, count_put
 
 _WORD_BITS: Final = 64  # bits of the number that rows are sorted by: key and row number
@@ -67,7 +68,7 @@ def sorted_batch(schema: TableSchema, rows: pa.RecordBatch) -> pa.RecordBatch:
 
 
 def ordered(keys: Sequence[Array]) -> tuple[Int64, list[Array]]:
-    """Return the order (n,) of rows by their keys (n,), the first foremost, and the keys in it; ties stay as they are.
+    """Return the stable order (n,) of rows by their keys (n,), the first key foremost, and the keys in that order.
 
     Where keys and row numbers fit into 64 bits together, such numbers are sorted: that is faster than by key and key.
     """
@@ -141,12 +142,12 @@ def _keys(schema: TableSchema, rows: pa.Table | pa.RecordBatch) -> list[Array]:
 
 
 def _place(column: pa.Array) -> tuple[object, ...]:
-    """Return what the values of an array are read from."""
+    """Return the memory of an array: equal for arrays that share it."""
     return column.type, column.offset, *(buffer and buffer.address for buffer in column.buffers())
 
 
 def _in(order: Int64, values: Array) -> Array:
-    """Return numbers (n,) in an order: the same array where all of them are one whole number."""
+    """Return numbers (n,) in an order; whole numbers that are all equal are returned as they are, without a copy."""
     if values.dtype.kind in "iu" and values[0] == values[-1] and (values == values[0]).all():
         return values
     return np.asarray(values[order])
@@ -351,42 +352,7 @@ def write_parquet(path: Path, rows: pa.Table, schema: TableSchema) -> None:
     if schema.compression == "lz4" and is_number_table(rows.schema):
         write_number_table(path, rows, schema.row_group_rows)
         return
-    _write_by_arrow(path, rows, schema)
-
-
-def parquet_bytes(rows: pa.Table, schema: TableSchema) -> bytes:
-    """Return the content of a small file of rows without lists of readings, as :func:`write_parquet` writes them."""
-    stream = pa.BufferOutputStream()
-    _write_by_arrow(stream, rows, schema)
-    content: bytes = stream.getvalue().to_pybytes()
-    return content
-
-
-def _write_by_arrow(to: Path | pa.NativeFile, rows: pa.Table, schema: TableSchema) -> None:
-    encodings: dict[str, str] = {}
-    strings: list[str] = []
-    for column in schema.columns:
-        leaf = f"{column.name}.list.element" if column.is_list else column.name
-        kind = column.type[5:-1] if column.is_list else column.type
-        if kind == "string":
-            strings.append(leaf)
-        elif column.encoding:
-            encodings[leaf] = column.encoding
-        elif kind.startswith("float"):
-            encodings[leaf] = "BYTE_STREAM_SPLIT"
-        elif kind != "uint8" and not column.variable:
-            encodings[leaf] = "DELTA_BINARY_PACKED"
-    pq.write_table(
-        rows,
-        to,
-        row_group_size=schema.row_group_rows,
-        compression=schema.compression,
-        compression_level=1 if schema.compression == "zstd" else None,
-        use_dictionary=strings,
-        column_encoding=encodings,
-        write_statistics=[c.name for c in schema.columns if not c.is_list],
-        write_page_checksum=True,
-    )
+    write_by_arrow(path, rows, schema)
 
 
 def _by_bin(schema: TableSchema, rows: pa.RecordBatch) -> list[tuple[int, pa.RecordBatch]]:

@@ -19,8 +19,15 @@ from roadscan.core.grid import TileId
 from roadscan.footprints.footprints import PRODUCT as FOOTPRINTS
 from roadscan.footprints.footprints import footprints_of
 from roadscan.georeference.plan.plan import SurveyPlan, plan_of
-from roadscan.georeference.plan.road import road_key
-from roadscan.georeference.sources import READING_COLUMNS, Georeferencer, MapSettings, RawSlice, geometry_of, read_rows
+from roadscan.georeference.sources import (
+    READING_COLUMNS,
+    Georeferencer,
+    MapSettings,
+    RawSlice,
+    geometry_of,
+    read_rows,
+    road_key,
+)
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded, median_pose_sigma
 from roadscan.poses.movement import level_poses
 from roadscan.poses.trajectory import Trajectory

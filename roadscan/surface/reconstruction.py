@@ -46,7 +46,7 @@ from roadscan.surface.triangulation import triangulate
 from roadscan.tiles.cells import TileCells
 
 if TYPE_CHECKING:
-    from roadscan.surface.clough_tocher import CubicSurface
+    pass
 
 
 RIM: Final = 3
@@ -463,40 +463,3 @@ class DetailedSettings(Strict):
         from roadscan.surface.normals import RINGS
 
         return (2 + RINGS) * self.max_gap_m
-
-
-def surface_through(points_m: npt.NDArray[np.float64], settings: DetailedSettings) -> CubicSurface:
-    """Returns the surface through points (n, 3): easting, northing, height (m, map frame), in any order.
-
-    Points at one place (to 10 µm) are merged to their mean height. Without three points that are not on a line the
-    surface has no triangles.
-
-    Raises
-    ------
-    RoadscanError
-        Where a coordinate is not finite.
-    """
-    from roadscan.surface.clough_tocher import cubic_surface
-    from roadscan.surface.normals import slopes_at
-
-    places = sites(points_m)
-    mesh = triangulate(places, settings.max_gap_m)
-    return cubic_surface(places, mesh, slopes_at(places, mesh, settings.slopes).slopes)
-
-
-def detailed_surface(
-    points_m: npt.NDArray[np.float64], window: GridWindow, settings: DetailedSettings
-) -> npt.NDArray[np.float64]:
-    """Heights (rows, columns) of a window's nodes (m, map frame), south row first, NaN where there is no surface.
-
-    Parameters
-    ----------
-    points_m : (n, 3) easting, northing, height (m, map frame), in any order: those of the window and of its halo
-        (:attr:`DetailedSettings.halo_m`), or all there are.
-
-    Raises
-    ------
-    RoadscanError
-        Where a coordinate is not finite.
-    """
-    return surface_through(points_m, settings).heights(window)

@@ -30,18 +30,15 @@ at whatever distance the vehicle drove between them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 import shapely
 from pydantic import Field
 
 from roadscan.compute.array_types import Bool, Float64, UInt8
 from roadscan.compute.arrays import way_along
-from roadscan.core.grid import QUANTA_PER_M, TileGrid, TileId
 from roadscan.core.strict import Strict
 from roadscan.surface.kernels import coarse as kernels
 from roadscan.surface.kernels.coarse import PATCH_SUMS, sum_patches
@@ -51,8 +48,7 @@ NOTHING: Final = kernels.NOTHING
 MEASURED: Final = kernels.MEASURED
 INTERPOLATED: Final = kernels.INTERPOLATED
 FILLED: Final = kernels.FILLED
-ORIGINS: Final = {NOTHING: "nothing", MEASURED: "measured", INTERPOLATED: "interpolated", FILLED: "filled"}
-"""Name of each origin of a node or cell."""
+"""Origins of a node."""
 
 
 class CoarseSettings(Strict):
@@ -66,8 +62,6 @@ class CoarseSettings(Strict):
     """Widest hole that is filled (m)."""
     every: int = Field(default=1, ge=1, le=16)
     """From one measured reading of a profile to the next: 2 for a mirror that measures every second one a turn."""
-    link_m: float = Field(default=0.5, gt=0.0)
-    """Profiles farther apart bound no surface between them (m)."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +135,7 @@ class CoarseModel:
     height_m: Float64
     """(n, K) heights after the median filter."""
     origin: UInt8
-    """(n, K), of :data:`ORIGINS`."""
+    """(n, K), one of the origins above."""
 
     @property
     def across_m(self) -> Float64:
@@ -155,57 +149,6 @@ class CoarseModel:
             self.zero_m[:, :1] + across * self.right[:, :1],
             self.zero_m[:, 1:] + across * self.right[:, 1:],
         )
-
-    def tile_cells(self, tile: TileId, grid: TileGrid) -> TileSurface:
-        """Returns the surface on the cells of a tile of the map: the mean of the nodes in each.
-
-        Between two profiles it is linear along the road, so cells that lie between profiles are filled. Heights
-        are summed as whole 10 µm: a cell has the same bits whatever stretch of road is given with it, if the profiles
-        that touch it and their neighbours are.
-        """
-        box, edge = grid.bounds(tile), grid.cells_per_edge
-        rows = self._near(box.easting_min_m, box.northing_min_m, grid.size_m)
-        sums, counts = np.zeros((edge, edge), np.int64), np.zeros((edge, edge), np.int32)
-        origin = np.zeros((edge, edge), np.uint8)
-        links = np.append(np.hypot(*np.diff(self.zero_m[rows], axis=0).T) <= self.settings.link_m, False)
-        east, north, right_east, right_north = (
-            np.ascontiguousarray(column) for column in (*self.zero_m[rows].T, *self.right[rows].T)
-        )
-        profiles = kernels.Profiles(
-            east, north, right_east, right_north, self.first_node, self.settings.spacing_m, self.height_m[rows],
-            self.origin[rows], links,
-        )  # fmt: skip
-        kernels.rasterise(
-            profiles, (box.easting_min_m, box.northing_min_m), grid.size_m / edge, 1.5 * edge / grid.size_m,
-            float(QUANTA_PER_M), kernels.CellSums(sums, counts, origin),
-        )  # fmt: skip
-        with np.errstate(invalid="ignore", divide="ignore"):
-            height: Float64 = np.where(counts > 0, sums / counts / QUANTA_PER_M, np.nan)
-        return TileSurface(tile, height, origin, counts)
-
-    def _near(self, west_m: float, south_m: float, size_m: float) -> slice:
-        """Returns the profiles, first to last, whose line may touch a square, with a neighbour on each side."""
-        across = self.across_m
-        if not across.size or not self.along_m.size:
-            return slice(0, 0)
-        ends = [self.zero_m + t * self.right for t in (across[0], across[-1])]
-        low, high = np.minimum(*ends), np.maximum(*ends)
-        corner = np.array([west_m, south_m])
-        touch = np.flatnonzero(((high >= corner) & (low <= corner + size_m)).all(axis=1))
-        return slice(max(int(touch[0]) - 1, 0), int(touch[-1]) + 2) if touch.size else slice(0, 0)
-
-
-@dataclass(frozen=True)
-class TileSurface:
-    """The coarse surface on the cells of one tile; arrays are (edge, edge), rows from south to north."""
-
-    tile: TileId
-    height_m: Float64
-    """NaN where there is none."""
-    origin: UInt8
-    """The best origin of the nodes in a cell, of :data:`ORIGINS`."""
-    count: npt.NDArray[np.int32]
-    """Number of nodes in a cell."""
 
 
 def coarse_model(stretch: Stretch, settings: CoarseSettings) -> CoarseModel:
@@ -229,7 +172,6 @@ def coarse_model(stretch: Stretch, settings: CoarseSettings) -> CoarseModel:
 
 
 FOUND: Final = "found"
-STATED: Final = "stated"
 
 _FEWEST: Final = 12
 """Least number of nodes in a patch."""
@@ -261,11 +203,6 @@ class Region:
         shapely.prepare(polygon)
         inside: Bool = shapely.intersects_xy(polygon, easting_m, northing_m)
         return inside
-
-
-def stated_regions(polygons: Iterable[npt.ArrayLike]) -> list[Region]:
-    """Returns regions that the user states: corners (k, 2) of each, easting and northing in the survey's map (m)."""
-    return [Region(np.asarray(one, np.float64), STATED) for one in polygons]
 
 
 def find_regions(model: CoarseModel, settings: RegionSettings) -> list[Region]:

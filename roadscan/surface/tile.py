@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 import numpy.typing as npt
+import shapely
 
 from roadscan.core.errors import ConfigError
 from roadscan.core.grid import Bounds, TileId
@@ -154,3 +155,29 @@ class SurfaceTile:
         """Returns row and column slices of the tile itself: the cells whose centre lies in it."""
         rows, columns = self.height_m.shape
         return slice(self.halo, rows - self.halo), slice(self.halo, columns - self.halo)
+
+
+@dataclass(frozen=True)
+class Regions:
+    """Regions in which the surface is made: (n,) polygons on the map (m)."""
+
+    shapes: npt.NDArray[Any]
+
+    def near(self, *boxes: Bounds) -> Regions:
+        """Returns those that intersect one of some boxes."""
+        own = [shapely.box(b.easting_min_m, b.northing_min_m, b.easting_max_m, b.northing_max_m) for b in boxes]
+        touch = shapely.intersects(self.shapes[:, None], np.array(own, object)[None, :])
+        return Regions(self.shapes[touch.any(axis=1)])
+
+    def key(self) -> list[str]:
+        """Returns a key of their corners, all that affects a surface."""
+        return sorted(one.hex() for one in shapely.to_wkb(self.shapes))
+
+    def holds(self, window: GridWindow) -> npt.NDArray[np.bool_]:
+        """Returns a mask (rows, columns) of the cells of a window whose centre lies in one of them."""
+        easting_m, northing_m = np.meshgrid(*window.nodes_m())
+        inside = np.zeros(easting_m.shape, bool)
+        for shape in self.shapes:
+            shapely.prepare(shape)
+            inside |= shapely.intersects_xy(shape, easting_m, northing_m)
+        return inside

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.asset_scores import Judged
-from benchmarks.bench_asset_probability import fitted
+from benchmarks.bench_asset_probability import fitted, of_evidence
 from roadscan.assets.kind import AssetKind, asset_kinds
 from roadscan.assets.probabilities import CURVES, Curve, curve_named
 
@@ -22,7 +22,7 @@ def test_more_evidence_is_never_less_probable(group: str) -> None:
     evidence = np.linspace(0.01, 0.99, 99)
     stated = np.array([CURVES[group].stated(p) for p in evidence])
     assert (np.diff(stated) > 0.0).all() and stated[0] > 0.0 and stated[-1] < 1.0
-    np.testing.assert_allclose([CURVES[group].of_evidence(p) for p in stated], evidence, atol=1e-6)
+    np.testing.assert_allclose([of_evidence(CURVES[group], p) for p in stated], evidence, atol=1e-6)
 
 
 def test_the_fit_finds_the_curve_that_objects_were_drawn_from() -> None:

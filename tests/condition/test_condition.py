@@ -38,7 +38,7 @@ from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import OutputRecord
 from roadscan.store.query.sql import query
 from roadscan.store.schema import table_schema
-from roadscan.store.writer import parquet_bytes
+from roadscan.store.small_tables import parquet_bytes
 from roadscan.tiles.cells import read_cells
 from roadscan.tiles.products.geo_table import write_geo_table
 from roadscan.tiles.tasks.tile_plan import TILE

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 from roadscan.cli import app
-from roadscan.store.codecs.image_files import comment_of, with_comment, with_tags, without_tags
+from roadscan.store.codecs.image_files import comment_of, with_comment, with_tags
 from tests.measuring.drive import DISTORTION, HEIGHT, MATRIX, WIDTH, Drive
 
 BAR_PX = 0.3
@@ -222,9 +222,13 @@ def test_jpeg_tags_leave_all_else_as_it_was(measured_drive: Drive) -> None:
     raw = measured_drive.survey_file.parent / "raw" / "run-1" / "camera"
     content = (raw / next(iter(measured_drive.poses))).read_bytes()
     tagged = with_tags(content, b"MM\0*\0\0\0\x08\0\0", b"<x/>")
-    assert (
-        without_tags(tagged) == without_tags(content) and with_tags(tagged, b"MM\0*\0\0\0\x08\0\0", b"<x/>") == tagged
+    added = b"".join(
+        b"\xff\xe1" + (len(of) + 2).to_bytes(2, "big") + of
+        for of in (b"Exif\0\0MM\0*\0\0\0\x08\0\0", b"http://ns.adobe.com/xap/1.0/\0<x/>")
     )
+    assert content.count(b"Exif\0\0") == content.count(b"http://ns.adobe.com/xap/") == 0
+    assert tagged == content[:2] + added + content[2:], "a byte beside the tags changed"
+    assert with_tags(tagged, b"MM\0*\0\0\0\x08\0\0", b"<x/>") == tagged, "the tags of before are not replaced"
     assert comment_of(with_comment(content, "σ")) == "σ" and len(with_comment(content, "σ")) == len(content) + 6
     for wrong in (b"", b"\x89PNG", content[:2] + b"\x00" + content[3:]):
         with pytest.raises(ValueError):

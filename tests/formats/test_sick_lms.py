@@ -13,10 +13,10 @@ import pytest
 from roadscan.core.errors import ConfigError, FormatError, TimeSystemError
 from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.core.rig import ScanGeometry
-from roadscan.formats.scanners.sick_telegrams import Checksums, checksum, encode_scans, find_telegrams, read_pieces
+from roadscan.formats.scanners.sick_telegrams import Checksums, checksum, find_telegrams, read_pieces
 from roadscan.ingest.reading.format import format_named, format_of
 from tests.formats.readings import Readings, read
-from tests.formats.sick_files import encode_telegram, write_telegrams
+from tests.formats.sick_files import encode_scans, encode_telegram, write_telegrams
 
 GPS = Clock(TimeSystem.GPS)
 GPS_NS = Clock(TimeSystem.GPS, unit="ns")

@@ -30,7 +30,6 @@ from roadscan.core.crs import MapFrame
 from roadscan.core.gpstime import Clock, TimeSystem
 from roadscan.core.rig import Sensor
 from roadscan.formats.clouds.e57_file import page_checksums
-from roadscan.formats.scanners.sick_telegrams import encode_scans
 from roadscan.ingest.reading.text_table import LINE_BYTES_MAX
 from tests.formats import (
     hesai_files,
@@ -72,7 +71,7 @@ from tests.formats import (
 from tests.formats.e57_files import PAGE, PAYLOAD, small_e57
 from tests.formats.nmea_files import Fix, sentences
 from tests.formats.ouster_files import ouster
-from tests.formats.sick_files import encode_telegram, write_telegrams
+from tests.formats.sick_files import encode_scans, encode_telegram, write_telegrams
 from tests.fuzz import bag_samples
 from tests.fuzz.mutations import Change, Inside
 from tests.fuzz.pose_samples import (

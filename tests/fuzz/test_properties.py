@@ -20,12 +20,12 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.core.crs import MapFrame
 from roadscan.core.gpstime import Clock, TimeSystem
-from roadscan.formats.scanners.sick_telegrams import encode_scans
 from roadscan.ingest.reading.text_table import Reject, TextOptions, text_blocks, text_layout
 from tests.formats import test_scans as scan_files
 from tests.formats import test_sick_lms as telegrams
 from tests.formats.log_reading import read_log
 from tests.formats.readings import read
+from tests.formats.sick_files import encode_scans
 
 WEEK = 2405
 WEEK_NS = WEEK * 604_800 * 10**9

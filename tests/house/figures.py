@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 
 from roadscan.run.keys import reached_code
+from tests.house.uncalled import of_repository
 
 LIBRARY = Path(__file__).resolve().parents[2] / "roadscan"
 
@@ -146,6 +147,11 @@ def _holds_number(value: ast.expr) -> bool:
     )
 
 
+def dead() -> dict[str, int]:
+    """Functions, methods and plain classes that nothing of the library refers to and no page names."""
+    return {"what nothing calls": len(of_repository())}
+
+
 def figures() -> dict[str, int]:
     """All figures by name."""
-    return size() | ways() | rooms() | words() | private_names() | constants() | budgets()
+    return size() | ways() | rooms() | words() | private_names() | constants() | dead() | budgets()

@@ -11,6 +11,7 @@ import pytest
 from tests.house import __main__ as command
 from tests.house import figures, limits
 from tests.house.limits import Limit
+from tests.house.uncalled import uncalled
 
 FOUND = {"lines": 120, "files": 7}
 
@@ -116,6 +117,33 @@ def test_files_with_words_of_llvm_are_counted(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(figures, "sources", lambda: {Path(name): text for name, text in texts.items()})
     found = {"files with private names of Numba": 1, "kernel files with LLVM words": 2}
     assert figures.private_names() == found
+
+
+def test_what_nothing_calls_is_named() -> None:
+    """Functions that call themselves alone, methods whose name is a variable elsewhere, and classes that none makes."""
+    first = """
+from pydantic import field_validator
+def called(): return _inner()
+def _inner(): return 1
+def alone(n): return alone(n - 1)
+def promised(): pass
+def done(): pass
+class Made:
+    def seen(self): return self
+    def hidden(self): return done()
+class Never:
+    def gone(self): pass
+class Handler(BaseHTTPRequestHandler):
+    def do_GET(self): pass
+class Kind(Format):
+    @field_validator("a")
+    def checks(self): pass
+"""
+    second = "from roadscan.a import called, Made\nhidden = alone = called()\nprint(hidden, alone, Made().seen())\n"
+    texts = {Path("roadscan/a.py"): first, Path("roadscan/b.py"): second}
+    found = uncalled(texts, {}, "A function that is `promised(now)`, and words like done.")
+    assert found == [f"roadscan/a.py:{name}" for name in ("alone", "hidden", "Never", "gone")]
+    assert "roadscan/a.py:Never" not in uncalled(texts, {Path("flows/c.py"): "from roadscan.a import Never\n"}, "")
 
 
 def test_the_limits_of_the_repository_hold() -> None:

@@ -20,12 +20,11 @@ from roadscan.cli import app
 from roadscan.core.errors import ConfigError
 from roadscan.core.strict import OPEN_QUESTION
 from roadscan.core.survey import Survey
-from roadscan.formats.scanners.sick_telegrams import encode_scans
 from roadscan.ingest.inspect.first_survey import FoundFolder, find_logs
 from roadscan.ingest.inspect.first_survey_text import FirstSurvey, write_first_survey
 from roadscan.simulate import simulate, truth
 from tests.answers import answer_questions, first_survey, roadscan, spared
-from tests.formats.sick_files import write_telegrams
+from tests.formats.sick_files import encode_scans, write_telegrams
 from tests.ingest.test_inspect import sbet, written
 from tests.surveys import Simulated, outputs, small_scene
 

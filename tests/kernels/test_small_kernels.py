@@ -19,7 +19,7 @@ from roadscan.georeference.kernels.tile_set import add_tile, block_ranges, empty
 from roadscan.georeference.kernels.timed_readings import between_ticks
 from roadscan.navigation.inertial.kernels.strapdown import geodetic_of, gravity_at, turned_frame
 from roadscan.pictures.kernels.lens import sample, take_better
-from roadscan.surface.kernels.coarse import CellSums, Profiles, rasterise, spline_profiles, sum_patches
+from roadscan.surface.kernels.coarse import spline_profiles, sum_patches
 from roadscan.surface.kernels.delaunay import flip_edges, grow, is_narrow, units, whitening
 from roadscan.surface.kernels.ground import depths, grounds, highest, rim, slopes
 from roadscan.surface.kernels.line_medians import keep_better, window_sums
@@ -204,7 +204,7 @@ def test_ties_are_differences_of_places() -> None:
     np.testing.assert_allclose(rows[:, :, 0], 2.0 * (after - residual) / 1e-6, atol=1e-6)
 
 
-def test_profiles_through_splines_patches_and_cells() -> None:
+def test_profiles_through_splines() -> None:
     """A plane stays a plane."""
     across = np.tile(np.arange(-1.0, 1.0001, 0.02), (4, 1))
     height, classes = 5.0 + 0.1 * across, np.zeros(across.shape, np.uint8)
@@ -212,12 +212,6 @@ def test_profiles_through_splines_patches_and_cells() -> None:
     spline_profiles(across, height, classes, 1, -10, 0.1, 0.3, 0.3, surface, origin)
     offsets = 0.1 * np.arange(-10, 11)
     np.testing.assert_allclose(surface, np.tile(5.0 + 0.1 * offsets, (4, 1)), atol=1e-12)
-    east, north, one, zero = np.zeros(4), 0.1 * np.arange(4), np.ones(4), np.zeros(4)
-    profiles = Profiles(east, north, one, zero, -10, 0.1, surface, origin, np.array([True, True, True, False]))
-    found = CellSums(np.zeros((2, 2), np.int64), np.zeros((2, 2), np.int32), np.zeros((2, 2), np.uint8))
-    rasterise(profiles, (-1.0, -0.05), 1.0, 1.5, 1e5, found)
-    assert found.counts.sum() == 4 * 20 and not found.counts[1].any()  # the node at +1 m lies in the next square
-    np.testing.assert_allclose(found.heights[0] / found.counts[0] / 1e5, [4.945, 5.045], atol=1e-5)
 
 
 def test_sums_of_patches() -> None:

@@ -11,12 +11,36 @@ import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 
+from roadscan.compute.kernel_options import kernel
 from roadscan.core.frames import ecef_from_ned, quaternion_from_rotation, rotation_from_rph
 from roadscan.navigation.inertial.alignment import ecef_from_level, gravity_ecef
-from roadscan.navigation.inertial.kernels.strapdown import increments, strapdown
+from roadscan.navigation.inertial.kernels.strapdown import gravity_field, increments, strapdown_step
 from tests.navigation.inertial_drives import NO_GAPS, simulated, urban
 
 TO_ECEF = pyproj.Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
+
+
+@kernel
+def strapdown(steps, turn, push, quaternions, velocities, positions):
+    """Run the free mechanisation from the first row of the outputs on.
+
+    Parameters
+    ----------
+    steps, turn, push : as from :func:`increments`, s of them.
+    quaternions : (s + 1, 4), velocities, positions : (s + 1, 3), ECEF; row 0 given, the others out.
+    """
+    q = (quaternions[0, 0], quaternions[0, 1], quaternions[0, 2], quaternions[0, 3])
+    v = (velocities[0, 0], velocities[0, 1], velocities[0, 2])
+    r = (positions[0, 0], positions[0, 1], positions[0, 2])
+    for s in range(steps.size):
+        field = gravity_field(r[0], r[1], r[2])
+        a, b = (turn[s, 0], turn[s, 1], turn[s, 2]), (push[s, 0], push[s, 1], push[s, 2])
+        q, v, r, _ = strapdown_step(q, v, r, a, b, steps[s], field)
+        for j in range(4):
+            quaternions[s + 1, j] = q[j]
+        for j in range(3):
+            velocities[s + 1, j] = v[j]
+            positions[s + 1, j] = r[j]
 
 
 def integrated(

@@ -10,7 +10,8 @@ import pytest
 
 from benchmarks.hard_streets import KINDS, SCANNERS, hard_street
 from benchmarks.labelled_returns import CLASSES, LabelledReturns, labelled_returns
-from roadscan.simulate.bodies import CLASS_OF_KIND, class_number
+from benchmarks.street_classes import CLASS_OF_KIND
+from roadscan.simulate.bodies import class_number
 from roadscan.simulate.lidar_model import lidar_model
 from roadscan.simulate.sensors.lidar import laser_errors
 from roadscan.simulate.trajectory import PoseErrors

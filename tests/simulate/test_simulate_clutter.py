@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from roadscan.simulate.bodies import PERSON, SIGN, TRUNK, WALL, class_of_kind
+from benchmarks.street_classes import class_of_kind
+from roadscan.simulate.bodies import PERSON, SIGN, TRUNK, WALL
 from roadscan.simulate.things import objects_table
 from tests.simulate.test_simulate_things import cast, flat, place, towards, world_of
 

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import maximum_filter
 
+from roadscan.simulate.kernels.road import survey_points
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
 
@@ -90,9 +91,18 @@ def sampled(sensor: Sensor, cells: int, cracks: list[dict[str, Any]], fine: int 
     east = scene.map.easting_m + _OFFSET_M + place * sensor.cell_m[1]
     easting, northing = np.broadcast_arrays(east[None, :], north[:, None])
     height = surface.height_m(easting, northing)
-    depth = surface.defect_depth_m(easting, northing)
+    depth = defect_depth_m(surface, easting, northing)
     height, depth = (a.reshape(cells, fine, cells, fine).mean(axis=(1, 3)) for a in (height, depth))
     return height, depth
+
+
+def defect_depth_m(surface: Surface, easting_m: Float64, northing_m: Float64) -> Float64:
+    """Return the depth of the pothole, crack or joint at map points (any shape, m); 0 where there is none."""
+    east, north = easting_m.ravel(), northing_m.ravel()
+    out = np.empty((east.size, 6))
+    local = (east - surface.origin_enh_m[0], north - surface.origin_enh_m[1])
+    survey_points(surface.arrays, *local, surface.nearest_node(east, north), out)
+    return out[:, 3].reshape(easting_m.shape)
 
 
 def measured(sensor: Sensor, truth_m: Float64, crack_m: Float64, seed: int) -> Patch:

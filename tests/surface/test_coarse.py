@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import generic_filter
 
-from roadscan.core.grid import TileGrid
 from roadscan.surface.kernels.coarse import median_filter, natural_spline
 from roadscan.surface.regions import (
     FILLED,
@@ -15,13 +16,11 @@ from roadscan.surface.regions import (
     INTERPOLATED,
     MEASURED,
     NOTHING,
-    STATED,
     CoarseSettings,
     RegionSettings,
     Stretch,
     coarse_model,
     find_regions,
-    stated_regions,
 )
 
 EAST, NORTH = 2_683_200.0, 1_247_900.0
@@ -107,31 +106,23 @@ def test_places_are_those_of_the_readings() -> None:
     assert nearest.max() < 0.006
 
 
-def test_tiles_do_not_depend_on_the_stretch() -> None:
-    grid = TileGrid(2.0, 0.05)
+def test_nodes_do_not_depend_on_the_stretch() -> None:
+    """Profiles of a part, all but its first and last, have the heights that they have within the whole."""
     easting, northing, height, classes, path = street(noise_m=0.006)
     classes[np.random.default_rng(4).random(classes.shape) < 0.05] = 10
-    whole = coarse_model(Stretch.of_points(easting, northing, height, classes, path), CoarseSettings())
-    tile = grid.tile_at(EAST + 1.9, NORTH + 2.3)
-    one = whole.tile_cells(tile, grid)
-    near = np.zeros(len(path), bool)
-    box = grid.bounds(tile)
-    for k in range(len(path)):
-        near[k] = ((easting[k] > box.easting_min_m) & (easting[k] < box.easting_max_m)
-                   & (northing[k] > box.northing_min_m) & (northing[k] < box.northing_max_m)).any()  # fmt: skip
-    rows = slice(max(np.flatnonzero(near)[0] - 3, 1), np.flatnonzero(near)[-1] + 4)
-    parts = [a[rows] for a in (easting, northing, height, classes, path)]
-    other = coarse_model(Stretch.of_points(*parts), CoarseSettings()).tile_cells(tile, grid)
-    assert (one.origin > 0).mean() > 0.9
-    for name in ("height_m", "origin", "count"):
-        assert np.array_equal(getattr(one, name), getattr(other, name), equal_nan=True)
-    e = (np.arange(40) + 0.5) * 0.05 + box.easting_min_m - EAST
-    n = (np.arange(40) + 0.5) * 0.05 + box.northing_min_m - NORTH
-    course = np.radians(40.0)
-    along = e * np.sin(course) + n[:, None] * np.cos(course)
-    across = e * np.cos(course) - n[:, None] * np.sin(course)
-    error = (one.height_m - surface_m(along, across))[one.origin > 0]
-    assert np.sqrt(np.mean(error**2)) < 0.003  # noise of 6 mm
+    stretch = Stretch.of_points(easting, northing, height, classes, path)
+    whole = coarse_model(stretch, CoarseSettings())
+    rows = slice(20, 41)
+    part = Stretch(*(getattr(stretch, one.name)[rows] for one in fields(Stretch)))
+    other = coarse_model(part, CoarseSettings())
+    shift = other.first_node - whole.first_node
+    columns = slice(shift, shift + other.height_m.shape[1])
+    for name in ("height_m", "origin"):
+        own, again = getattr(whole, name)[rows, columns], getattr(other, name)
+        np.testing.assert_array_equal(own[1:-1], again[1:-1])
+    error = (whole.height_m - surface_m(whole.along_m[:, None], whole.across_m))[whole.origin > 0]
+    assert (whole.origin > 0).mean() > 0.9
+    assert np.sqrt(np.mean(error**2)) < 0.004  # noise of 6 mm
 
 
 def test_regions_are_found_where_the_road_is_broken_and_nowhere_else() -> None:
@@ -171,18 +162,9 @@ def test_a_vehicle_that_stands_finds_no_region(profiles: int) -> None:
     assert find_regions(coarse_model(stretch, CoarseSettings()), RegionSettings()) == []
 
 
-def test_regions_that_the_user_states() -> None:
-    (one,) = stated_regions([[(0.0, 0.0), (4.0, 0.0), (4.0, 2.0)]])
-    assert one.origin == STATED
-    assert one.polygon.area == pytest.approx(4.0)
-    assert one.holds(np.array([3.0, 0.5]), np.array([1.0, 1.9])).tolist() == [True, False]
-
-
 def test_a_stretch_without_road_is_empty() -> None:
     easting, northing, height, classes, path = street(profiles=4)
     classes[:] = 9
     model = coarse_model(Stretch.of_points(easting, northing, height, classes, path), CoarseSettings())
     assert model.height_m.shape == (4, 0)
     assert find_regions(model, RegionSettings()) == []
-    grid = TileGrid(2.0, 0.05)
-    assert not model.tile_cells(grid.tile_at(EAST, NORTH), grid).origin.any()

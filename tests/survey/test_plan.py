@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import xml.etree.ElementTree as ET
 from collections import Counter
 from pathlib import Path
@@ -17,8 +18,9 @@ from roadscan.core.survey import Survey
 from roadscan.ingest.reading.format import LogFormat, log_formats
 from roadscan.run.engine.compute import Inline
 from roadscan.run.session import Session
-from roadscan.run.stage import Stage, stage_named, stages
+from roadscan.run.stage import WORKER_BASE_BYTES, Stage, stage_named, stages
 from roadscan.store.asset_schema import asset_tables
+from roadscan.store.logs import read_log_records
 from roadscan.store.schema import schema_names, table_schema
 from roadscan.survey import plan, status
 from roadscan.survey.run import run_stages
@@ -124,6 +126,24 @@ def test_after_a_changed_setting_it_says_what_the_run_then_does(copy: Simulated)
     after = planned(copy)
     assert after["tiles"]["state"] == "current"
     assert after["products"]["current"] == 7  # the filter met no reading: unknown was the word for it
+
+
+def test_memory_of_a_worker_is_told_of_what_searches_returns(copy: Simulated) -> None:
+    """It grows with the readings of a task: by 100 bytes each of a row group, by 430 each of a scene."""
+    text = copy.survey_file.read_text()
+    assert "[adjust]\non = false\n" in text
+    copy.survey_file.write_text(text.replace("on = false", "on = true") + "\n[assets]\n")
+    found = planned(copy)
+    logs = read_log_records(copy.store())
+    returns = sum(file.rows for log in logs for file in log.tables.get("returns", ()))
+    profiles = [sorted(n for file in log.tables.get("scans", ()) for n in file.group_rows) for log in logs]
+    assert returns > 1000 and sum(map(sum, profiles)) > 100
+    of_assets = found["assets"]["worker_memory_bytes"] - WORKER_BASE_BYTES
+    assert 200 * returns < of_assets < 430 * 1.2 * returns  # all squares fit into one scene; some returns lie in none
+    placed, kept = max(map(max, filter(None, profiles))), max(sum(own[-8:]) for own in profiles)
+    of_adjust = found["adjust"]["worker_memory_bytes"] - WORKER_BASE_BYTES
+    assert of_adjust == 200 * (100 * placed + 3 * kept)  # of profiles alone, with 200 readings each
+    assert not re.search(r"^ *(adjust|assets) .* \? *$", printed(copy, "plan"), re.MULTILINE)
 
 
 def test_reasons(copy: Simulated) -> None:

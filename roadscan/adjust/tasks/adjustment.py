@@ -99,7 +99,7 @@ from roadscan.core.counted import listed
 from roadscan.core.extras import can_draw
 from roadscan.core.witness import Finding
 from roadscan.georeference.plan.plan import SurveyPlan, poses_plan_of
-from roadscan.georeference.plan.road import road_key
+from roadscan.georeference.sources import road_key
 from roadscan.navigation.tasks.recorded_pictures import NOT_DRAWN
 from roadscan.poses.movement import largest
 from roadscan.run.engine.compute import run_bundles

@@ -29,9 +29,8 @@ from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.counted import listed
 from roadscan.core.grid import of_run
 from roadscan.georeference.plan.plan import SurveyPlan, mountings_of, trajectory_source
-from roadscan.georeference.plan.road import road_key
-from roadscan.georeference.sources import load_mountings
-from roadscan.navigation.tasks.clock_tables import load_clocks
+from roadscan.georeference.sources import load_mountings, road_key
+from roadscan.navigation.tasks.trajectories import load_clocks
 from roadscan.pictures.exposures import Exposures, camera_pictures, exposures_of
 from roadscan.pictures.points import TABLE, measured_points
 from roadscan.pictures.ties.tracks import ALL, TRACKS

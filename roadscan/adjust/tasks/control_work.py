@@ -29,16 +29,15 @@ from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
-from roadscan.georeference.plan.road import road_key
-from roadscan.georeference.sources import MapSettings, MountingChanges
+from roadscan.georeference.sources import MapSettings, MountingChanges, road_key
 from roadscan.poses.movement import Seat
 from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.schema import table_schema
+from roadscan.store.small_tables import parquet_bytes
 from roadscan.store.store import Store
-from roadscan.store.writer import parquet_bytes
 
 TABLE: Final = "control_lines"
 CONTROL_LINE: Final = Witness(

@@ -28,8 +28,7 @@ from roadscan.core.counted import counted
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
-from roadscan.georeference.plan.road import road_key
-from roadscan.georeference.sources import Georeferencer, MapSettings, ReadingSource, geometry_of, read_rows
+from roadscan.georeference.sources import Georeferencer, MapSettings, ReadingSource, geometry_of, read_rows, road_key
 from roadscan.pictures.exposures import Exposures, read_picture
 from roadscan.pictures.lens import pixels_of
 from roadscan.run.keys import code_digest, key_of
@@ -38,8 +37,8 @@ from roadscan.store.digest import bytes_digest
 from roadscan.store.logs import DataFile
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
+from roadscan.store.small_tables import parquet_bytes
 from roadscan.store.store import Store
-from roadscan.store.writer import parquet_bytes
 
 RETURNS: Final = "tie_returns"
 """Table, and product of its files in the manifest."""

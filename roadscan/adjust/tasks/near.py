@@ -29,6 +29,7 @@ from roadscan.georeference.sources import (
     read_rows,
 )
 from roadscan.poses.movement import LevelPoses, MountingChange, Seat, level_poses
+from roadscan.run.stage import BYTES_PER_READING, WORKER_BASE_BYTES
 from roadscan.store.logs import DataFile
 from roadscan.store.store import Store
 
@@ -43,7 +44,9 @@ _BESIDE_M: Final = 0.2
 _KEPT_GROUPS: Final = 8
 """Row groups of profiles cached, as they are stored."""
 _KEPT_RETURNS: Final = 6_000_000
-"""Returns of a lidar cached, georeferenced: those of one place are near the next one, too. They take 34 bytes each."""
+"""Returns of a lidar cached, georeferenced: those of one place are near the next one, too."""
+_BYTES_PER_KEPT_RETURN: Final = 34  # place, intensity, row, epoch and laser of a cached return (bytes)
+_BYTES_PER_STORED_READING: Final = 3  # range and intensity of a reading of a profile, as stored (bytes)
 
 
 Sources: TypeAlias = Sequence[tuple[ReadingSource, tuple[DataFile, ...]]]
@@ -132,6 +135,21 @@ def remounted_of(files: Sequence[NearFile], changes: MountingChanges) -> dict[tu
         if change is not None:
             found[source.run, source.sensor] = Remounted(change, source.mountings, source.has_parallel_beams)
     return found
+
+
+def memory_of(sources: Sources) -> int:
+    """Returns the approximate memory (bytes) of a worker at most: what it caches, and a row group that is placed."""
+    returns, largest, stored = 0, 0, 0
+    for source, files in sources:
+        geometry = geometry_of(source)
+        groups = [rows * (1 if geometry is None else geometry.readings) for file in files for rows in file.group_rows]
+        largest = max(largest, *groups) if groups else largest
+        if source.table == "returns":
+            returns += sum(groups)
+        else:
+            stored = max(stored, sum(sorted(groups)[-_KEPT_GROUPS:]))
+    kept = min(returns, _KEPT_RETURNS + largest) * _BYTES_PER_KEPT_RETURN + stored * _BYTES_PER_STORED_READING
+    return WORKER_BASE_BYTES + kept + largest * BYTES_PER_READING
 
 
 @dataclass(frozen=True)

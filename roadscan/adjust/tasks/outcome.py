@@ -33,12 +33,12 @@ from roadscan.poses.movement import MountingChange, Seat
 from roadscan.poses.trajectory import Corrections
 from roadscan.run.engine.compute import Compute, reason_of
 from roadscan.run.keys import key_of
-from roadscan.store.codecs.grey_picture import write_png
+from roadscan.store.codecs.image_files import write_png
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.schema import table_schema
+from roadscan.store.small_tables import parquet_bytes
 from roadscan.store.store import Store
-from roadscan.store.writer import parquet_bytes
 
 ADJUSTMENT: Final = "adjustment"
 SOLUTION: Final = "solution"

@@ -23,15 +23,14 @@ from roadscan.adjust.ties.tie import HEIGHT, LASERS, SAME_PASS
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
-from roadscan.georeference.plan.road import road_key
-from roadscan.georeference.sources import MapSettings, MountingChanges
+from roadscan.georeference.sources import MapSettings, MountingChanges, road_key
 from roadscan.poses.movement import Seat
 from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
+from roadscan.store.small_tables import parquet_bytes
 from roadscan.store.store import Store
-from roadscan.store.writer import parquet_bytes
 
 TIES: Final = "ties"
 """Table, and product of its files in the manifest."""

@@ -136,7 +136,7 @@ class Pictures:
 
 
 def shift_ties(pictures: Pictures, first: int, second: int) -> list[Tie]:
-    """Returns ties of two patches of one place: of relief and of paint none, one or two directions each.
+    """Returns the ties of two patches of one place: up to two directions of the relief, and up to two of the paint.
 
     Where an image makes no tie, one row states why.
     """
@@ -247,7 +247,7 @@ class _Equations:
 
     @property
     def scores(self) -> Float64:
-        """Covariance (2, 2) of the sum of scores, from blocks, with a few blocks' worth of the expected one."""
+        """Returns the covariance (2, 2) of the sum of scores: that of blocks, averaged with the expected one."""
         row, column = self.cell // _BLOCK_CELLS
         _, number = np.unique(row * 4096 + column, return_inverse=True)
         sums = np.stack([np.bincount(number, self.score[:, k]) for k in (0, 1)], axis=-1)

@@ -113,8 +113,9 @@ def _of_one_pass(tried: Column) -> Bool:
 def agreeing(
     tried: Column, near: Column, settings: AgainSettings, fine: TieSettings, most_up_m: float
 ) -> tuple[Bool, Float64]:
-    """Rows of larger patches of one pair of runs that agree with most others on a shift that ties would not find,
-    and that shift (3,): second minus first, north, east, down (m).
+    """Returns a mask (n,) of the larger patches that agree on a shift which ties did not find, and that shift (3,).
+
+    The shift is the second run's place minus the first one's: north, east, down (m).
 
     Parameters
     ----------

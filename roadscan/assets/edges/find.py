@@ -90,11 +90,11 @@ def found_edges(raster: HeightRaster, heights: Heights, settings: EdgeSettings =
     parts: list[Edge] = []
     for chain in paths_of(step_places(raster)):
         nodes = profiles.nodes_of(profiles.chain_line(chain), heights, raster, slopes)
-        parts += _told(nodes, chain.evidence, settings)
+        parts += _measured_runs(nodes, chain.evidence, settings)
     return _bridged(parts, heights, raster, slopes, settings)
 
 
-def _told(nodes: Nodes, evidence: float, settings: EdgeSettings) -> list[Edge]:
+def _measured_runs(nodes: Nodes, evidence: float, settings: EdgeSettings) -> list[Edge]:
     """Returns runs of nodes with a measurable step; up to two nodes without are left inside a run."""
     known = np.isfinite(nodes.sigma_step_m)
     low, high, scatter = (_medians_of_five(c, known) for c in (nodes.seen_low, nodes.seen_high_m, nodes.scatter_m))
@@ -261,8 +261,9 @@ def _medians_of_known(values: Float64) -> Float64:
 
 
 def _of_returns(scene: Scene, place: Float64) -> dict[str, Float64]:
-    """Shares of the returns on each side of the edges that stand above the ground and that show plants; how beams cross
-    the edges: 0 at a right angle, as they meet the ring that a laser draws on the ground.
+    """Returns features (n,) of the returns beside each node: shares that stand and that grow by side, and `crossing`.
+
+    `crossing` is the mean cosine between beams and the edge: 0 where the edge lies along the ring that a laser draws.
     """
     raster, returns, count = raster_of(scene), scene.returns, len(place)
     rows = np.flatnonzero(_near(place, raster)[np.maximum(raster.cell, 0)] & (raster.cell >= 0))
@@ -302,7 +303,7 @@ def _near(place: Float64, raster: HeightRaster) -> Bool:
 
 
 def _outward(scene: Scene, place: Float64) -> Float64:
-    """Returns the sine (n,) by which the higher side lies away from the nearest place of the drive."""
+    """Returns the sine (n,) from an edge's direction to the way from the drive; positive where it rises outward."""
     drive = scene.drive_xyh_m
     if not len(drive):
         return np.full(len(place), np.nan)

@@ -94,7 +94,7 @@ def paths_of(places: Places, settings: PathSettings = DEFAULT) -> list[Chain]:
 
 
 def _own_evidence(place: Float64, quality: Float64, settings: PathSettings) -> float:
-    """Evidence (σ · m) of the places that belong to a chain alone, not to a stronger one that it leads to."""
+    """Returns the evidence (σ · m) of a chain's places; those that it shares with a stronger chain do not count."""
     length = np.hypot(*np.diff(place[:, :2], axis=0).T)
     free = np.minimum(length, FREE_M)
     return float(np.sum(free * 0.5 * (quality[1:] + quality[:-1]) - (length - free) * settings.gap_cost))

@@ -84,7 +84,7 @@ def tops(levels, first, start, gap, out):
 
 @kernel
 def marked(x, y, above, origin, per_m, cells, lowest, highest, out):
-    """Compute the number (n,) int32 of the cell of each return between the heights of that number; else 0.
+    """Write the number (n,) int32 of each return's cell, and 0 where the return is outside that number's heights.
 
     cells : (rows, columns) int32; lowest, highest : (numbers,) float64, heights by number (m).
     """

@@ -22,6 +22,7 @@ from roadscan.assets.quantiles import median
 from roadscan.assets.scene import Box, Scene, once_a_scene
 from roadscan.assets.upright.pieces import seen_by_each
 from roadscan.compute.array_types import Bool, Float64, Int64
+from roadscan.compute.arrays import SIGMA_OF_MAD
 
 CUBE_M: Final = 0.25
 """Edge of a cube (m). Cubes lie on the map's grid, so that no cut moves them."""
@@ -235,7 +236,7 @@ def _without_neighbours(place: Float64, span: Span) -> Span:
     if span.rows.size < _LEAST_CUBES:
         return span
     for _ in range(_ROUNDS):
-        deviation = np.maximum(1.4826 * np.array([median(off) for off in np.abs(span.off_m).T]), _LEAST_OFF_M)
+        deviation = np.maximum(SIGMA_OF_MAD * np.array([median(off) for off in np.abs(span.off_m).T]), _LEAST_OFF_M)
         inside = (np.abs(span.off_m) <= _OUTLIER * deviation).all(axis=1)
         if inside.all() or np.count_nonzero(inside) < _LEAST_CUBES:
             return span

@@ -76,13 +76,6 @@ class Contrast:
     rough_cells: int = 0
     """Those of them that scatter by too much: no paint is sought there."""
 
-    def cell_of(self, x_m: Float64, y_m: Float64) -> Int64:
-        """Returns the cell of points (n,) within the window."""
-        rows, columns = self.mean.shape
-        column = np.clip(((x_m - self.box.x_min_m) / CELL_M).astype(np.int64), 0, columns - 1)
-        row = np.clip(((y_m - self.box.y_min_m) / CELL_M).astype(np.int64), 0, rows - 1)
-        return np.asarray(row * columns + column, np.int64)
-
 
 def contrast_of(scene: Scene) -> Contrast:
     """Returns the contrast of a scene's returns that lie on the ground and on no vehicle or person."""

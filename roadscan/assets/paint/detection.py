@@ -216,8 +216,6 @@ class Patch:
 
     shape: shapely.Geometry
     """Polygon, from the corner of the scene's returns."""
-    is_bar: bool
-    """True for a straight band, false for cells."""
     in_crosswalk: bool
     road_rad: float
     """Direction of the road there, anticlockwise from x; NaN where no drive is near."""
@@ -310,7 +308,7 @@ def _of_stripe(stripe: Stripe, crossed: bool, road_rad: float) -> Patch:
     aside = stripe.width_m / 2 * np.array([-stripe.along[1], stripe.along[0]])
     begin, end = stripe.at(stripe.begin_m), stripe.at(stripe.end_m)
     shape = shapely.Polygon([begin - aside, end - aside, end + aside, begin + aside])
-    return Patch(shape, True, crossed, road_rad, stripe.contrast, stripe.probability, stripe.returns, stripe.around)
+    return Patch(shape, crossed, road_rad, stripe.contrast, stripe.probability, stripe.returns, stripe.around)
 
 
 def _of_cells(found: Contrast, component: Component, crossed: bool, road_rad: float) -> Patch:
@@ -324,7 +322,7 @@ def _of_cells(found: Contrast, component: Component, crossed: bool, road_rad: fl
         np.stack([found.x_m[outside], found.y_m[outside]], axis=1), distance_upper_bound=AROUND_M
     )
     level = float(np.mean(found.contrast[inside])) if inside.size else 0.0
-    return Patch(shape, False, crossed, road_rad, level, component.probability, inside, outside[np.isfinite(away)])
+    return Patch(shape, crossed, road_rad, level, component.probability, inside, outside[np.isfinite(away)])
 
 
 LINE_PIECES: Final = pa.schema(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -28,10 +28,11 @@ from roadscan.core.grid import TileId
 from roadscan.core.strict import Strict
 from roadscan.run.engine.compute import reason_of
 from roadscan.run.keys import code_digest, key_of
+from roadscan.run.stage import WORKER_BASE_BYTES
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.schema import table_schema
+from roadscan.store.small_tables import parquet_bytes
 from roadscan.store.store import Store
-from roadscan.store.writer import parquet_bytes
 from roadscan.tiles.product import ProductContext, publish_file
 from roadscan.tiles.tasks.tile_plan import Block
 from roadscan.tiles.tasks.tiles import TaskResult
@@ -44,7 +45,6 @@ SCREENS: Final = "asset_screens"
 """Manifest name of the occluders of views."""
 VISIBILITY: Final = "asset_visibility"
 """Cells of a square, and how many passes had them in sight."""
-OF_SQUARES: Final = (EVIDENCE, CLASSIFIED, BARE_EARTH, SCREENS, VISIBILITY)
 
 
 def evidence_unit(kind: str, square: TileId) -> str:
@@ -60,7 +60,7 @@ class SquareWork:
     kinds: tuple[tuple[str, str], ...]
     """Names of the kinds whose evidence is due, with its key."""
     beside: Mapping[str, str]
-    """Other outputs that are due: the key of each of :data:`OF_SQUARES` by its name."""
+    """Other outputs that are due: the key of each, by its name in the manifest."""
 
 
 @dataclass(frozen=True)
@@ -126,6 +126,26 @@ def evidence_tasks(
     for one in due:  # what one scene holds is searched by one task
         blocks.setdefault(first[plan.together[one.square]], []).append(one.square)
     return [_task(plan, due, shared, tuple(squares)) for _, squares in sorted(blocks.items())]
+
+
+_BYTES_PER_SCENE_RETURN: Final = 400
+"""Measured memory of a worker per return of its largest scene (bytes)."""
+_BYTES_PER_BLOCK_RETURN: Final = 30
+"""Memory per return of all squares of a task, which stay placed while one scene after another is searched (bytes)."""
+
+
+def memory_of(plan: AssetPlan, tasks: Sequence[EvidenceTask]) -> int:
+    """Returns the approximate memory (bytes) that a worker needs for the largest of some tasks."""
+
+    def returns(squares: Iterable[TileId]) -> int:
+        return sum(plan.readings[one] for one in squares)
+
+    largest = max(
+        _BYTES_PER_BLOCK_RETURN * returns(task.load.squares)
+        + _BYTES_PER_SCENE_RETURN * max(map(returns, task.together))
+        for task in tasks
+    )
+    return WORKER_BASE_BYTES + largest
 
 
 def singly(

@@ -19,8 +19,7 @@ from roadscan.assets.settings import GroundSectionsConfig
 from roadscan.assets.tasks.evidence import BARE_EARTH
 from roadscan.assets.tiling import AssetGrid
 from roadscan.compute.array_types import Bool, Float64
-from roadscan.condition.road_line import RoadLine
-from roadscan.condition.tasks.lines import Roads
+from roadscan.condition.road_line import RoadLine, Roads
 from roadscan.core.grid import TileId
 from roadscan.run.keys import code_digest, key_of
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded

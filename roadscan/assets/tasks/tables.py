@@ -19,8 +19,7 @@ from roadscan.assets.tasks.objects import OBJECTS
 from roadscan.assets.tasks.picture_work import PicturePlan
 from roadscan.assets.tasks.plan import AssetPlan, WantedKind
 from roadscan.compute.array_types import Float64, Int64
-from roadscan.condition.road_line import Lane
-from roadscan.condition.tasks.lines import Roads
+from roadscan.condition.road_line import Lane, Roads
 from roadscan.core.rig import UNMOUNTED, Mountings
 from roadscan.georeference.plan.plan import trajectory_source
 from roadscan.georeference.sensor_places import sensor_places

@@ -67,7 +67,7 @@ class Spots(NamedTuple):
 
 
 class _Fan(NamedTuple):
-    """Returns (k,) about a plate, by sweep, laser and epoch."""
+    """The k returns near a plate, ordered by sweep, laser and epoch."""
 
     rows: Int64
     sensor: Float64
@@ -185,9 +185,7 @@ def _fan(scene: Scene, rows: Int64, normal: Float64) -> _Fan | None:
 
 @dataclass(frozen=True, eq=False)
 class _Order:
-    """How the beams over a plate follow one another: in time, or, where all returns of a sweep bear one stamp, as their
-    lines run over the plate.
-    """
+    """The order of the beams over a plate: by time, or along the scan lines where a sweep has one stamp."""
 
     scene: Scene
     begin: int
@@ -216,7 +214,7 @@ def _ends_of_stamps(scene: Scene) -> Int64:
 
 
 def _order_of(scene: Scene, rows: Int64) -> _Order | None:
-    """Returns how the beams to some rows follow one another; None where no laser met two of them in one sweep."""
+    """Returns the order of the beams to some rows; None where no laser met two of them in one sweep."""
     if not rows.size:
         return None
     returns, ends = scene.returns, _ends_of_stamps(scene)
@@ -251,7 +249,7 @@ def _longest_lines(sweep: Int64, laser: Int64, moment: Float64) -> Int64:
 def _around(
     scene: Scene, rows: Int64, order: _Order, longest: tuple[Int64, Int64]
 ) -> tuple[Int64, Int64, Bool]:  # fmt: skip
-    """Rows (k,) of the beams near a plate or sent with its longest lines, their sweeps; who answered (sweeps, lasers).
+    """Returns rows (k,) near a plate or of its longest lines, their sweeps, and which lasers answered (sweeps, lasers).
 
     longest : the first and the last return (sweeps,) of the longest line of each sweep.
     """

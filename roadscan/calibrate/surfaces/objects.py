@@ -228,47 +228,9 @@ _OUTLYING: Final = 4.0  # A difference farther from the median than this many σ
 
 
 @dataclass(frozen=True)
-class Agreement:
-    """Agreement of two heads in the cells that both see."""
+class CellHeights:
+    """Mean heights of the cells of a level frame that hold enough readings."""
 
-    cells: int
-    mean_m: float
-    """Mean of first − second."""
-    rms_m: float
-    beyond_noise_m: float
-    """RMS less the scatter of the readings within their cells, which is noise and texture."""
-
-
-def agreement(first: Placed, second: Placed, cell_m: float = 0.01, least: int = 4) -> Agreement:
-    """Compare mean heights in cells of the level frame that hold at least so many readings of each head.
-
-    Cells across an edge have no one height and are left out: those whose readings scatter far more than usual.
-
-    Raises
-    ------
-    NavigationError
-        where the heads have no such cell in common.
-    """
-    near, other = (_cells(one.place_m, cell_m, least) for one in (first, second))
-    _, a, b = np.intersect1d(near.key, other.key, assume_unique=True, return_indices=True)
-    if a.size == 0:
-        raise NavigationError(
-            f"'{first.readings.sensor}' and '{second.readings.sensor}' see no place in common in "
-            f"{first.readings.drive}",
-            expected=f"cells of {cell_m:g} m with {least} readings of each",
-            change="take larger cells, or heads whose profiles overlap",
-        )
-    away = near.height_m[a] - other.height_m[b]
-    noise = near.variance_m2[a] + other.variance_m2[b]
-    even = noise <= _EVEN * np.median(noise)
-    a, away, noise = a[even], away[even], noise[even]
-    mean_square = float(np.mean(away**2))
-    beyond = max(mean_square - float(noise.mean()), 0.0)
-    return Agreement(int(a.size), float(away.mean()), mean_square**0.5, beyond**0.5)
-
-
-@dataclass(frozen=True)
-class _Cells:
     key: Int64
     height_m: Float64
     variance_m2: Float64
@@ -279,7 +241,8 @@ class _Cells:
     """(m,) index of one of them."""
 
 
-def _cells(place_m: Float64, cell_m: float, least: int) -> _Cells:
+def cell_heights(place_m: Float64, cell_m: float, least: int) -> CellHeights:
+    """Returns the cells with at least so many of the places (n, 3; m, level frame)."""
     whole = np.floor(place_m[:, :2] / cell_m).astype(np.int64)
     key, inverse = np.unique((whole[:, 0] << 32) + whole[:, 1], return_inverse=True)
     count = np.bincount(inverse)
@@ -293,7 +256,7 @@ def _cells(place_m: Float64, cell_m: float, least: int) -> _Cells:
     middle = np.stack([np.bincount(inverse, place_m[:, k] - origin[k]) / count for k in (0, 1)], axis=-1) + origin
     reading = np.zeros(key.size, dtype=np.int64)
     reading[inverse] = np.arange(inverse.size)
-    return _Cells(key[enough], mean[enough] + place_m[:, 2].mean(), variance, middle[enough], reading[enough])
+    return CellHeights(key[enough], mean[enough] + place_m[:, 2].mean(), variance, middle[enough], reading[enough])
 
 
 @dataclass
@@ -325,7 +288,7 @@ def _strip(first: Placed, second: Placed, level_from_world: Float64) -> Ties | N
     """Return the ties of two heads in one drive."""
     if first.readings.sensor == second.readings.sensor:
         return None
-    own, other = (_cells(one.place_m, _COMPARED_CELL_M, _LEAST) for one in (first, second))
+    own, other = (cell_heights(one.place_m, _COMPARED_CELL_M, _LEAST) for one in (first, second))
     _, a, b = np.intersect1d(own.key, other.key, assume_unique=True, return_indices=True)
     if a.size < _LEAST:
         return None
@@ -342,7 +305,7 @@ def _strip(first: Placed, second: Placed, level_from_world: Float64) -> Ties | N
     return Ties("overlap, heads", _seen(first, own, a), _seen(second, other, b), weight)
 
 
-def _seen(one: Placed, cells: _Cells, which: Int64) -> Seen:
+def _seen(one: Placed, cells: CellHeights, which: Int64) -> Seen:
     """Return mean places of cells as the head would have seen them from the pose of one of their readings."""
     place = np.concatenate([cells.middle_m[which], cells.height_m[which, None]], axis=1)
     return one.seen(place, one.readings.pose[cells.reading[which]].astype(np.int64))

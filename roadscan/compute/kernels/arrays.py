@@ -48,7 +48,6 @@ def range_bounds(ranges, low, high):
 
 
 BINS = 256  # Bins of one pass over the numbers.
-_BITS = 8  # Binary logarithm of BINS.
 _FEW = 48
 """Up to this many numbers are sorted directly."""
 

@@ -11,6 +11,7 @@ import numba
 import numpy as np
 from numba.extending import intrinsic
 
+from roadscan.compute.arrays import SIGMA_OF_MAD
 from roadscan.compute.kernel_options import Kernel, bare
 from roadscan.compute.kernels import vectors
 from roadscan.compute.kernels.vectors import I16, I32, I64, constant, everywhere, instruction, load, store
@@ -19,9 +20,8 @@ from roadscan.compute.numba_internals import ir, types
 LANES = 16  # Cells that are handled at a time: 32-bit lanes of a 512-bit register.
 LARGEST = np.int32(2**31 - 1)  # Stands for a missing height in sorting.
 
-MAD_TO_SIGMA = 1.4826  # Standard deviation of a normal distribution in median absolute deviations.
 OUTLIER_SIGMAS = 3.0  # Heights farther from the median than this many robust σ do not count.
-REACH = OUTLIER_SIGMAS * MAD_TO_SIGMA
+REACH = OUTLIER_SIGMAS * SIGMA_OF_MAD
 """Heights up to this many median absolute deviations (MAD) from the median count."""
 
 _F64 = ir.DoubleType()

@@ -23,9 +23,9 @@ import numpy as np
 
 from roadscan.compute.array_types import Float64
 from roadscan.compute.arrays import scatter_about
-from roadscan.condition.edge_raster import STATION_M
 from roadscan.condition.index import ConditionIndex, How, PerCrossSection, Quantity, Value, by_section
 from roadscan.condition.lane_data import SPACING_M, LaneData, LaneLines
+from roadscan.condition.road_line import STATION_M
 
 _AROUND_M: Final = 15.0  # Length before and behind a place over which middles of a line are used.
 _LEAST_PLACES: Final = 5  # Least number of these middles.

@@ -90,7 +90,7 @@ def bent_slopes(found, count, base, half, sums, blocks, slopes):
 
 @inner
 def block_scatter(sums, b, slopes, cell_m):
-    """Return the variance of the heights of block b about its plane (m²): of cells, plus of readings within them.
+    """Return the variance of heights about the plane of block b (m²): between its cells plus within them.
 
     NaN where neither is known. slopes : (blocks² + 1, 2) of the blocks, and of the whole square in the last row.
     """
@@ -164,7 +164,7 @@ def peaks(found, count, base, half, pitch, lattice, out):
 
 @inner
 def fill_blocks(found, count, base, half, blocks, sums):
-    """Sum up heights and positions of the cells of each block of a square, and of all in the last row.
+    """Sum heights and positions of the cells of each block of a square; the last row is the sum of all blocks.
 
     blocks : along an edge; sums : (blocks² + 1, SUMS) float64, out: heights count from base (m), places from the
     square's middle (m).

@@ -12,13 +12,14 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.arrays import SIGMA_OF_MAD
 from roadscan.compute.kernel_options import inlined, inner, kernel
 
 MOST_CELLS = 4096
 """Most cells of a window that are used; of a denser window those of its first rows."""
 ENOUGH_CELLS = 100.0
 """In windows of four times as many cells and more, one in two rows and columns is used, and so on."""
-OUTLIER = 3.0 * 1.4826
+OUTLIER = 3.0 * SIGMA_OF_MAD
 """Cells this many median absolute deviations from the first surface are left out of the second."""
 LEAST_SCALE_M = 0.0005
 """Least median absolute deviation that is assumed (m)."""

@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,7 +23,7 @@ import shapely
 
 from roadscan.compute.array_types import Float64
 from roadscan.compute.arrays import scatter_about
-from roadscan.condition.road_line import Lane, RoadLine
+from roadscan.condition.road_line import Lane, RoadLine, Roads
 from roadscan.condition.roads import Drive, StatedLine, find_roads
 from roadscan.condition.settings import ConditionConfig
 from roadscan.core.crs import MapFrame
@@ -54,15 +54,6 @@ _LINE_SETTINGS: Final = (
     "reference", "layer_crs", "layer_options", "lanes", "same_road_m", "smoothing_m", "lane_smoothing_m",
     "lane_width_m",
 )  # fmt: skip
-
-
-@dataclass(frozen=True, eq=False)
-class Roads:
-    """Lines and lanes from the store."""
-
-    lines: dict[str, RoadLine]
-    """Lines by road."""
-    lanes: tuple[Lane, ...]
 
 
 def lines_key(plan: SurveyPlan, config: ConditionConfig) -> str:

@@ -23,8 +23,9 @@ from roadscan.condition.road_edges import (
     road_edges,
     road_surfaces,
 )
+from roadscan.condition.road_line import Roads
 from roadscan.condition.settings import ConditionConfig, RoadEdgesConfig
-from roadscan.condition.tasks.lines import Roads
+from roadscan.condition.tasks.stretches import EDGE_PIECE_M, EDGES, edge_unit
 from roadscan.condition.tasks.tasks import PieceTask, tiles_beside
 from roadscan.core.grid import TileGrid, TileId
 from roadscan.core.survey import Survey
@@ -36,16 +37,13 @@ from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import bytes_digest, file_digest
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.schema import table_schema
-from roadscan.store.writer import parquet_bytes
+from roadscan.store.small_tables import parquet_bytes
 from roadscan.tiles.cells import read_cells
 from roadscan.tiles.products.geo_table import write_geo_table
 from roadscan.tiles.tasks.tiles import TaskResult
 
-EDGES: Final = "road_edge_offsets"
 SURFACES: Final = "road_surface"
 _OUTPUTS: Final = (EDGES, SURFACES)
-EDGE_PIECE_M: Final = 100
-"""Length of a piece of road."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,11 +61,6 @@ class EdgePiece:
     def unit(self) -> str:
         """Its name in the manifest."""
         return edge_unit(self.stretch.line.road, int(self.stretch.from_m) // EDGE_PIECE_M)
-
-
-def edge_unit(road: str, number: int) -> str:
-    """Return the name of a piece of a road in the manifest."""
-    return f"{road}/{number:06d}"
 
 
 EdgeTask: TypeAlias = PieceTask[EdgePiece, RoadEdgesConfig]

@@ -14,11 +14,10 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.compute.array_types import Float64
-from roadscan.condition.road_line import Lane, RoadLine
+from roadscan.condition.road_line import Lane, RoadLine, Roads
 from roadscan.condition.roughness_rasters import RoadPoints, normalised_intensity
 from roadscan.condition.roughness_regions import Region, SectionRegions, find_regions
 from roadscan.condition.settings import RoughnessRegionsConfig
-from roadscan.condition.tasks.lines import Roads
 from roadscan.condition.tasks.tasks import PieceTask, tiles_beside
 from roadscan.core.canvas import empty_figure
 from roadscan.core.extras import can_draw
@@ -29,7 +28,7 @@ from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import bytes_digest, file_digest
 from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.schema import table_schema
-from roadscan.store.writer import parquet_bytes
+from roadscan.store.small_tables import parquet_bytes
 from roadscan.tiles.cells import TileCells, read_cells
 from roadscan.tiles.products.geo_table import write_geo_table
 from roadscan.tiles.tasks.tiles import TaskResult

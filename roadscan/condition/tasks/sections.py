@@ -16,8 +16,8 @@ import pyarrow.compute as pc
 import pyarrow.csv as pa_csv
 import shapely
 
-from roadscan.condition.road_line import Lane, RoadLine
-from roadscan.condition.tasks.lines import LANES, LINES, Roads
+from roadscan.condition.road_line import Lane, RoadLine, Roads
+from roadscan.condition.tasks.lines import LANES, LINES
 from roadscan.condition.tasks.values import VALUES
 from roadscan.core.grid import TileId
 from roadscan.run.keys import code_digest, key_of

@@ -17,10 +17,9 @@ import shapely
 
 from roadscan.condition.kernels.sampling import CellTable
 from roadscan.condition.lane_data import SQUARE_M
-from roadscan.condition.road_line import Lane, RoadLine
+from roadscan.condition.road_line import Lane, RoadLine, Roads
 from roadscan.condition.settings import ConditionConfig, SectionConfig
 from roadscan.condition.survey_lane import LaneHeights, reach_m, survey_lane
-from roadscan.condition.tasks.lines import Roads
 from roadscan.core.errors import ConfigError, StoreError
 from roadscan.core.grid import Bounds, TileGrid, TileId
 from roadscan.core.survey import Survey
@@ -29,13 +28,23 @@ from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded
 from roadscan.store.schema import table_schema
+from roadscan.store.small_tables import parquet_bytes
 from roadscan.store.store import Store
-from roadscan.store.writer import parquet_bytes
 from roadscan.surface.reconstruction import SurfaceGrid
 from roadscan.surface.settings import SurfaceConfig
 from roadscan.tiles.cells import TileCells, read_cells
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.tasks.tiles import TaskResult
+
+EDGES: Final = "road_edge_offsets"
+"""Table of the road's edges, which a task reads or makes piece by piece."""
+EDGE_PIECE_M: Final = 100
+"""Length of a piece of road whose edges are one file (m)."""
+
+
+def edge_unit(road: str, number: int) -> str:
+    """Return the name of a piece of a road in the manifest."""
+    return f"{road}/{number:06d}"
 
 
 def check_surface_cells(survey: Survey) -> None:

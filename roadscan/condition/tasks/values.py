@@ -29,18 +29,19 @@ from roadscan.condition.lane_data import (
     edges_on_lane,
     located,
 )
-from roadscan.condition.road_line import Lane, RoadLine
+from roadscan.condition.road_line import Lane, RoadLine, Roads
 from roadscan.condition.settings import SectionConfig
 from roadscan.condition.survey_lane import window_m2
-from roadscan.condition.tasks.lines import Roads
-from roadscan.condition.tasks.road_edges import EDGE_PIECE_M, EDGES, edge_unit
 from roadscan.condition.tasks.stretches import (
     CROSS_SECTIONS,
+    EDGE_PIECE_M,
+    EDGES,
     LANE_LINES,
     LANE_TEXTURE,
     OF_STRETCHES,
     PROFILES,
     STRETCH_M,
+    edge_unit,
     unit_of,
 )
 from roadscan.core.witness import Finding
@@ -49,8 +50,8 @@ from roadscan.run.keys import code_digest, key_of, name_of
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, read_recorded, recorded_table
 from roadscan.store.schema import table_schema
+from roadscan.store.small_tables import parquet_bytes
 from roadscan.store.store import Store
-from roadscan.store.writer import parquet_bytes
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.geo_table import read_geo_table
 from roadscan.tiles.tasks.tiles import TaskResult

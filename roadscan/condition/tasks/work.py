@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from roadscan.condition.road_line import Roads
 from roadscan.condition.settings import ConditionConfig
-from roadscan.condition.tasks.lines import LANES, LINES, Roads, current_lines, lines_key, load_roads
+from roadscan.condition.tasks.lines import LANES, LINES, current_lines, lines_key, load_roads
 from roadscan.condition.tasks.pictures import PICTURES, PictureTask, due_pictures, plan_pictures
 from roadscan.condition.tasks.ravelling import RAVELLING, RAVELLING_PICTURES, PatchTask, due_patches, plan_patches
-from roadscan.condition.tasks.road_edges import EDGES, SURFACES, EdgePiece, due_edges, plan_edges, stated_surface
+from roadscan.condition.tasks.road_edges import SURFACES, EdgePiece, due_edges, plan_edges, stated_surface
 from roadscan.condition.tasks.roughness_regions import (
     REGION_PICTURES,
     REGION_SECTIONS,
@@ -20,6 +21,7 @@ from roadscan.condition.tasks.roughness_regions import (
 )
 from roadscan.condition.tasks.sections import SECTIONS, TILES, SectionFiles, due_files, due_tiles, plan_sections
 from roadscan.condition.tasks.stretches import (
+    EDGES,
     OF_STRETCHES,
     SURFACE_FILES,
     Stretch,

@@ -56,7 +56,6 @@ _LARGEST_ANGLE_DEG: Final = 180.0  # an angle file with larger ones is none
 _SEQUENCE, _IMU, _SAFETY, _SIGNED, _CONFIDENCE = 0x01, 0x02, 0x04, 0x08, 0x10
 """Bits of the head's flags: what else the packet holds."""
 _POLYNOMIAL: Final = 0x04C1_1DB7  # of CRC-32/MPEG-2, most significant bit first
-_DATE: Final = ("date", "u1", (6,))  # year less 1900, month, day, hour, minute, second
 
 
 @dataclass(frozen=True)

@@ -170,7 +170,7 @@ def _wanted_of(capture: _Capture, wanted: Wanted) -> Iterator[Datagram | Reject]
 def datagrams_of_sizes(
     path: Path, sizes: Collection[int] | None, port: int | None = None, sender: str | None = None
 ) -> Iterator[Datagram | Reject]:
-    """Yield the packets of some lengths in file order, of any length, to any port and of any sender where it is None.
+    """Yield the packets of some lengths to a port from a sender, in file order; None stands for any.
 
     Packets in several fragments are put together (RFC 791, RFC 8200): they count as their first one. A record that is
     none, and a packet whose fragments do not all arrive, are rejected; other traffic is ignored.

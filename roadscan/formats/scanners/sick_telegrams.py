@@ -168,16 +168,6 @@ def checksum(data: bytes) -> int:
     return remainder
 
 
-def checksum_of_rows(rows: UInt8) -> UInt16:
-    """Return the CRC (n,) of each row of (n, bytes)."""
-    state = np.zeros(rows.shape[0], dtype=np.uint16)
-    before = np.zeros(rows.shape[0], dtype=np.uint16)
-    for column in rows.T.astype(np.uint16):
-        state = _shifted(state) ^ column ^ (before << np.uint16(8))
-        before = column
-    return state
-
-
 # --- finding telegrams -----------------------------------------------------------------------------
 
 
@@ -285,50 +275,3 @@ def _pieces(stream: IO[bytes]) -> Iterator[Piece]:
         starts, ends, resume = find_telegrams(data, is_end=is_end)
         yield Piece(data, offset, starts, ends)
         carry, offset = data[resume:].tobytes(), offset + resume
-
-
-# --- writing ---------------------------------------------------------------------------------------
-
-
-def encode_scans(
-    ranges: UInt16,
-    unit: Unit,
-    *,
-    remission: UInt8 | None = None,
-    quarter: int | None = None,
-    status: int = 0x10,
-) -> UInt8:
-    """Return telegrams of measured values, one per scan.
-
-    Parameters
-    ----------
-    ranges : (n, readings) as the scanner counts them, flag bits and codes included.
-    remission : (n, readings); telegrams are then of command 0xC4, which carries both.
-    quarter : 0 to 3: partial scans whose first reading lies that many quarters of a degree beside the first angle;
-        None for complete scans.
-
-    Returns
-    -------
-    (n, bytes), a telegram a row.
-
-    Raises
-    ------
-    FormatError
-        if no telegram holds so many readings.
-    """
-    count, readings = ranges.shape
-    word = readings | UNITS.index(unit) << 14 | (0 if quarter is None else 1 << PARTIAL_BIT | quarter << QUARTER_BIT)
-    command = ALL_VALUES if remission is None else VALUES_AND_REMISSION
-    values = np.ascontiguousarray(ranges.astype("<u2")).view(np.uint8).reshape(count, 2 * readings)
-    parts = [np.array([command, word & 0xFF, word >> 8]), values]
-    if remission is not None:
-        parts += [np.array([readings, 1, readings], dtype="<u2").view(np.uint8), remission]
-    parts.append(np.array([status]))
-    payload = np.concatenate([np.broadcast_to(p, (count, p.shape[-1])).astype(np.uint8) for p in parts], axis=1)
-    length = payload.shape[1]
-    if readings > COUNT_MASK or length > LONGEST_PAYLOAD:
-        raise FormatError(f"{readings} readings a telegram, {length} bytes", expected=f"{LONGEST_PAYLOAD} bytes")
-    head = np.array([STX, FROM_SCANNER, length & 0xFF, length >> 8], dtype=np.uint8)
-    body = np.concatenate([np.broadcast_to(head, (count, head.size)), payload], axis=1)
-    crc = checksum_of_rows(body).astype("<u2")[:, None].view(np.uint8)
-    return np.concatenate([body, crc], axis=1)

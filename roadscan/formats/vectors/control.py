@@ -292,3 +292,7 @@ def need_role(column: bool, role: Role | None, file: Path) -> None:
             file=file,
             missing=Missing("options.role", "gcp"),
         )
+
+
+BY_HAND, FOUND = "by hand", "found"
+"""Sources of points measured in pictures."""

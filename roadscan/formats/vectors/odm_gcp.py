@@ -17,8 +17,8 @@ from pyproj.exceptions import CRSError as ProjCrsError
 from roadscan.core.crs import crs_from_text
 from roadscan.core.errors import ConfigError, CrsError, FormatError, Missing
 from roadscan.core.strict import Strict
-from roadscan.formats.vectors.control import ControlFrame, ControlReader, RawControl, Role, need_role
-from roadscan.formats.vectors.picture_points import BY_HAND, RawPoints, point_items
+from roadscan.formats.vectors.control import BY_HAND, ControlFrame, ControlReader, RawControl, Role, need_role
+from roadscan.formats.vectors.picture_points import RawPoints, point_items
 from roadscan.ingest.reading.columns import UNITS
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject
 from roadscan.ingest.reading.records import options_of

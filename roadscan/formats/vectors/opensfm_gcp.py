@@ -14,8 +14,8 @@ from pydantic import Field
 
 from roadscan.core.errors import ConfigError, FormatError, Missing
 from roadscan.core.strict import Strict
-from roadscan.formats.vectors.control import ControlFrame, ControlReader, RawControl, Role, need_role
-from roadscan.formats.vectors.picture_points import BY_HAND, RawPoints, point_items
+from roadscan.formats.vectors.control import BY_HAND, ControlFrame, ControlReader, RawControl, Role, need_role
+from roadscan.formats.vectors.picture_points import RawPoints, point_items
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, beside
 from roadscan.ingest.reading.records import options_of
 from roadscan.store.codecs.image_files import ImageError, image_size

@@ -12,6 +12,7 @@ import pyarrow as pa
 
 from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.errors import FormatError, nearest
+from roadscan.formats.vectors.control import BY_HAND, FOUND
 from roadscan.ingest.reading.format import Item, LogFormat, LogHeader, LogSource, Reject, Rows
 from roadscan.ingest.reading.records import NO_TEXT, Sieve, options_of
 from roadscan.ingest.reading.text_table import (
@@ -25,8 +26,6 @@ from roadscan.ingest.reading.text_table import (
 )
 
 TABLE: Final = "picture_points"
-BY_HAND, FOUND = "by hand", "found"
-"""Sources of measurements."""
 _FARTHEST_PX: Final = 200_000.0  # places farther from a picture's corner count as damage (pixels)
 _LARGEST_SIGMA_PX: Final = 1_000.0  # larger σ count as damage (pixels)
 

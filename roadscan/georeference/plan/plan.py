@@ -21,9 +21,10 @@ from roadscan.core.grid import LanePass, RunId, TileGrid, of_run
 from roadscan.core.rig import UNMOUNTED, Mounting, Mountings, Rig, Sensor
 from roadscan.core.survey import Survey
 from roadscan.georeference.place import HeightLimits
-from roadscan.georeference.plan.road import CentreLines, centre_lines_key, centre_lines_of, check_road, road_of
+from roadscan.georeference.plan.road import centre_lines_key, centre_lines_of, check_road, road_of
 from roadscan.georeference.road_profiles import TICK_NS, WINDOW_NS
 from roadscan.georeference.sources import (
+    CentreLines,
     MapSettings,
     MountingChanges,
     RawSlice,

@@ -11,7 +11,6 @@ import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -34,7 +33,7 @@ from roadscan.formats.vectors.road_lines import (
     read_lines,
     sidecars,
 )
-from roadscan.georeference.sources import ReadingSource
+from roadscan.georeference.sources import CentreLines, ReadingSource
 from roadscan.ingest.reading.format import Reject
 from roadscan.store.digest import file_digest
 
@@ -77,22 +76,6 @@ class CentreLineBuffer:
 
 BUFFER: Final = "buffer"
 CLASS: Final = "class"
-
-
-@dataclass(frozen=True)
-class CentreLines:
-    """The centre-line layer and the distances kept beside its lines. Sent to workers: it holds no data."""
-
-    path: Path
-    digests: tuple[str, ...]
-    """Digests of the layer's files, so that a changed layer counts as another one."""
-    crs: str | None
-    width: str
-    """"buffer", "class", or the attribute with the road's width."""
-    buffer_m: float
-    margin_m: float
-    options: str
-    """Settings of the layer (JSON of ``RoadLinesOptions``)."""
 
 
 def centre_lines_of(survey: Survey) -> CentreLines | None:
@@ -220,8 +203,3 @@ def check_road(settings: RoadSegmentation | None, sources: Sequence[ReadingSourc
         expected="scans of a sensor that looks down, its x along the driving direction",
         change="name sensors of scans in segmentation.sensors, or take the section out",
     )
-
-
-def road_key(source: ReadingSource) -> list[object]:
-    """Return the key by which tiles become stale when a source's segmentation changes; empty where it has none."""
-    return [] if source.road is None else [source.road.model_dump(mode="json", exclude={"sensors"})]

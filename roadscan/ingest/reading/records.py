@@ -265,7 +265,7 @@ class UnorderedStamps:
 
     @classmethod
     def of(cls, clock: Clock, sample: Float64, file: Path) -> Self:
-        """Return a converter with the middle one of `sample` (n,), finite stamps of the log's start, as its anchor.
+        """Return a converter anchored at the median of `sample` (n,): finite stamps of the log's start.
 
         Raises
         ------

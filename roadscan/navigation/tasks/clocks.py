@@ -31,7 +31,9 @@ from roadscan.navigation.clocks.signals import (
     turning_of_imu,
 )
 from roadscan.navigation.inertial.readings import OdometerReadings
-from roadscan.navigation.tasks.clock_tables import (
+from roadscan.navigation.tasks.navigation_logs import imu_readings, odometer_readings
+from roadscan.navigation.tasks.recorded_pictures import CLOCK_PICTURE, keep_file, picture_key, remove_others
+from roadscan.navigation.tasks.trajectories import (
     ClockEstimate,
     clock_picture_path,
     clock_unit,
@@ -39,8 +41,6 @@ from roadscan.navigation.tasks.clock_tables import (
     kept_estimates,
     load_clocks,
 )
-from roadscan.navigation.tasks.navigation_logs import imu_readings, odometer_readings
-from roadscan.navigation.tasks.recorded_pictures import CLOCK_PICTURE, keep_file, picture_key, remove_others
 from roadscan.poses.trajectory import Trajectory
 from roadscan.run.keys import code_digest, key_of, name_of
 from roadscan.store.logs import NAVIGATION, LogRecord, read_log_records

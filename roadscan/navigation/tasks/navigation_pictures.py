@@ -18,10 +18,10 @@ from roadscan.core.survey import Survey
 from roadscan.navigation.inertial.motion import ned_from_world
 from roadscan.navigation.inertial.readings import Innovations, Solution
 from roadscan.navigation.picture import NavigationPicture, draw_navigation
-from roadscan.navigation.tasks.clock_tables import load_clocks
 from roadscan.navigation.tasks.navigation_logs import gnss_solutions
 from roadscan.navigation.tasks.recorded_pictures import NAVIGATION_PICTURE, keep_file, picture_key, remove_others
 from roadscan.navigation.tasks.solve_trajectory import SMOOTHER, on_time
+from roadscan.navigation.tasks.trajectories import load_clocks
 from roadscan.store.logs import LogRecord, read_log_records
 from roadscan.store.manifest import Manifest
 from roadscan.store.readings.row_groups import read_groups

@@ -11,11 +11,11 @@ from roadscan.core.errors import ConfigError, DamagedError
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding, Witness
-from roadscan.navigation.tasks.clock_tables import clock_picture_path, clock_unit, kept_estimates
 from roadscan.navigation.tasks.navigate import plan_trajectories
 from roadscan.navigation.tasks.navigation_pictures import picture_path
 from roadscan.navigation.tasks.odometry_trajectory import LOCAL_MAP, ODOMETRY
 from roadscan.navigation.tasks.solve_trajectory import PlannedTrajectory
+from roadscan.navigation.tasks.trajectories import clock_picture_path, clock_unit, kept_estimates
 from roadscan.store.logs import NAVIGATION, LogRecord, has_log
 from roadscan.store.store import Store
 

@@ -42,9 +42,9 @@ from roadscan.navigation.odometry import (
     way_of,
     windows_of,
 )
-from roadscan.navigation.tasks.clock_tables import load_clocks
 from roadscan.navigation.tasks.navigation_logs import chosen, imu_readings, sensor_of
 from roadscan.navigation.tasks.solve_trajectory import Computed, on_time, sigma_figures, trajectory_rows
+from roadscan.navigation.tasks.trajectories import load_clocks
 from roadscan.run.keys import code_digest, key_of, name_of
 from roadscan.store.logs import NAVIGATION, LogRecord
 from roadscan.store.readings.row_groups import read_groups
@@ -231,7 +231,7 @@ _TILT_RAD: Final = np.radians(2.0)  # gravity of a window against that of the dr
 def findings(
     subject: str, way: Way, matched: Matched, windows: Windows | None, config: OdometryConfig, max_gap_s: float
 ) -> Iterator[Finding]:
-    """Yield a finding for each kind of contradiction, with the number of its times and the worst of them."""
+    """Yield a finding for each kind of contradiction: how often it occurs, and when it is worst."""
 
     def told(bad: Bool, at: Int64, size: Float64, words: str, left_out: int = 0) -> Iterator[Finding]:
         if bad.any():

@@ -17,7 +17,7 @@ import numpy as np
 from roadscan.compute.array_types import Int64
 from roadscan.core.gpstime import gps_ns_from_utc
 from roadscan.core.grid import of_run
-from roadscan.navigation.tasks.clock_tables import load_clocks
+from roadscan.navigation.tasks.trajectories import load_clocks
 from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import file_digest
 from roadscan.store.logs import LogRecord

@@ -24,7 +24,6 @@ from roadscan.core.grid import of_run
 from roadscan.core.survey import Survey
 from roadscan.ingest.clock_correction import ClockCorrection
 from roadscan.navigation.inertial.readings import GnssSolutions, Innovations, Solution, VehicleSensors
-from roadscan.navigation.tasks.clock_tables import load_clocks
 from roadscan.navigation.tasks.navigation_logs import (
     RunLogs,
     chosen,
@@ -33,6 +32,7 @@ from roadscan.navigation.tasks.navigation_logs import (
     odometer_readings,
     vehicle_sensors,
 )
+from roadscan.navigation.tasks.trajectories import load_clocks
 from roadscan.run.keys import code_digest, key_of, name_of
 from roadscan.store.logs import NAVIGATION, LogRecord
 from roadscan.store.schema import table_schema

@@ -277,25 +277,6 @@ class Sought:
     """Why it was not found; empty where it was."""
 
 
-def find_targets(
-    pictures: Pictures,
-    points: Sequence[TargetPoint],
-    settings: PictureTargetsConfig | None = None,
-    read: Read | None = None,
-) -> pa.Table:
-    """Return the control targets found in pictures, rows of the table `picture_points` with the source `found`.
-
-    Parameters
-    ----------
-    pictures : with their stated poses and lenses; a picture that cannot be read, or is of another size than its lens
-        is for, costs itself alone.
-    points : control points, where they were surveyed.
-    settings : how far poses may be off, and what counts as a target.
-    read : gives grey values; from the pictures' files where left out.
-    """
-    return found_rows(pictures, seek(pictures, points, settings, read))
-
-
 def found_rows(pictures: Pictures, sought: Iterable[Sought]) -> pa.Table:
     """Return the rows of the table `picture_points` of what was found, in the table's order."""
     rows = [_row(pictures, one, one.found) for one in sought if one.found is not None]
@@ -309,7 +290,16 @@ def seek(
     settings: PictureTargetsConfig | None = None,
     read: Read | None = None,
 ) -> Iterator[Sought]:
-    """Yield each target that may be in a picture, picture by picture, found or with the reason why not."""
+    """Yield each target that may be in a picture, picture by picture, found or with the reason why not.
+
+    Parameters
+    ----------
+    pictures : with their stated poses and lenses; a picture that cannot be read, or is of another size than its lens
+        is for, costs itself alone.
+    points : control points, where they were surveyed.
+    settings : how far poses may be off, and what counts as a target.
+    read : gives grey values; from the pictures' files where left out.
+    """
     settings = settings or PictureTargetsConfig()
     places = np.array([p.place_map_m for p in points], np.float64).reshape(-1, 3)
     worlds = [pictures.map.world_from_map(world, places) for world in pictures.worlds]

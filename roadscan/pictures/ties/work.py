@@ -26,8 +26,8 @@ from roadscan.store.codecs.image_files import ImageError
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
 from roadscan.store.schema import table_schema
+from roadscan.store.small_tables import parquet_bytes
 from roadscan.store.store import Store
-from roadscan.store.writer import parquet_bytes
 
 FEATURES: Final = "picture_features"
 MATCHES: Final = "picture_matches"

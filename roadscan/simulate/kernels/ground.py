@@ -195,14 +195,6 @@ def kerb_height(road: RoadArrays, k: int, u: float, offset: float) -> float:
     return value
 
 
-@compiled
-def kerb_heights(road: RoadArrays, station: Float64, offset: Float64, out: Float64) -> None:
-    """Write the height of the kerb on the side of places (m); 0: none. All arrays (n,)."""
-    for i in range(station.size):
-        k = node_at(road, station[i])
-        out[i] = kerb_height(road, k, station[i] - road.nodes[k, STATION], offset[i])
-
-
 @inner
 def steps_height(road: RoadArrays, k: int, u: float, offset: float) -> float:
     """Return the height that kerbs and patches add (m)."""

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from roadscan.compute.array_types import Bool, Float32, Float64, Int64
+from roadscan.compute.array_types import Float32, Float64, Int64
 from roadscan.simulate.kernels.options import compiled, inlined, inner, mixed
 
 NODE_STEP_M = 0.5
@@ -23,7 +23,6 @@ STATION = 12
 DEFECTS, DEFECTS_END, PATCHES, PATCHES_END, ITEMS, ITEMS_END = 13, 14, 15, 16, 17, 18  # row numbers
 FALL_LEFT, FALL_RIGHT, KERB_LEFT, KERB_RIGHT = 19, 21, 23, 25  # columns of falls and kerbs
 HUMPS, HUMPS_END = 27, 28  # columns of humps
-NODE_COLUMNS = 29  # numbers of a node
 
 # Places in the section.
 CROWN, LANES_EDGE, SHOULDER_SLOPE, PAVED_EDGE, VERGE_SLOPE, ROUNDING, SURFACE_EDGE, KERB_FACE = 0, 1, 2, 3, 4, 5, 6, 7
@@ -491,21 +490,3 @@ def heights_along(road: RoadArrays, station: Float64, offset: Float64, out: Floa
     for i in range(station.size):
         k = node_at(road, station[i])
         out[i] = worn_height(road, k, station[i] - road.nodes[k, STATION], offset[i])
-
-
-@compiled
-def find_paint(road: RoadArrays, station: Float64, offset: Float64, out: Bool) -> None:
-    """Write whether places are on paint that is not worn off: lines, stop bars, zebra crossings. All arrays (n,)."""
-    nodes, lines, items = road.nodes, road.lines, road.items
-    for p in range(station.size):
-        s, o = station[p], offset[p]
-        found = False
-        for i in range(lines.shape[0]):
-            if abs(o - lines[i, 0]) <= lines[i, 1] and lines[i, 4] <= s <= lines[i, 5]:
-                is_dash = lines[i, 3] == 0.0 or s % lines[i, 3] < lines[i, 2]
-                found = found or (is_dash and not is_worn(lines[i, 6], s, o))
-        k = node_at(road, s)
-        for i in range(int(nodes[k, ITEMS]), int(nodes[k, ITEMS_END])):
-            inside = items[i, 0] == 0.0 and abs(s - items[i, 2]) <= items[i, 4] and abs(o - items[i, 3]) <= items[i, 5]
-            found = found or (inside and not is_worn(items[i, 6], s, o))
-        out[p] = found

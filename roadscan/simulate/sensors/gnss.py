@@ -48,8 +48,6 @@ class Solutions:
     """(n,) :data:`FIXED` or :data:`FLOAT`."""
     sigma_ned_m: Float64
     """(n, 3) as the receiver states them; of a multipath jump it knows nothing."""
-    jump_ned_m: Float64
-    """(n, 3) multipath error within the position, for the truth."""
 
 
 def antenna_mount(scene: Scene) -> Mount:
@@ -87,7 +85,6 @@ def solve(scene: Scene, drive: Drive) -> Solutions:
         velocity[seen],
         quality[seen],
         np.maximum(stated_sigma, 0.001)[seen],
-        jumps[seen],
     )
 
 

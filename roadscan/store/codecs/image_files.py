@@ -1,8 +1,11 @@
-"""Checks size and completeness of JPEG, PNG and TIFF files without decoding them.
+"""Checks size and completeness of JPEG, PNG and TIFF files without decoding them, and writes grey PNG and BMP.
 
 Decoders fill up what is missing, and allocate what a header claims; so the structure is checked first: what a file cut
 short, or filled with zeros at its end, no longer has. Damage inside the compressed pixels stays unseen, as finding it
 means decoding every image. Pillow reads TIFF's tags; it does not say whether JPEG and PNG are complete.
+
+Grey PNG is put together here, because at cell resolution the time goes into compressing, and Pillow compresses with
+zlib; Pillow writes BMP, and reads both back.
 
 JPEG: ITU-T T.81, annex B. PNG: W3C PNG (third edition), sections 5 and 11. TIFF: TIFF 6.0, section 2, and BigTIFF.
 """
@@ -16,9 +19,17 @@ import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Final
+from typing import TYPE_CHECKING, Any, BinaryIO, Final
 
-from roadscan.store.codecs.zlib_stream import crc32
+import numpy as np
+import numpy.typing as npt
+
+from roadscan.core.errors import StoreError
+from roadscan.store.codecs.zlib_stream import compressed, crc32
+
+if TYPE_CHECKING:
+    from rasterio.transform import Affine
+
 
 JPEG: Final = b"\xff\xd8\xff"
 PNG: Final = b"\x89PNG\r\n\x1a\n"
@@ -378,13 +389,6 @@ def with_tags(jpeg: bytes, exif: bytes, xmp: bytes) -> bytes:
     return _START + _segment(content) + _segment(_XMP + xmp) + _without_tags(jpeg)
 
 
-def without_tags(jpeg: bytes) -> bytes:
-    """Return a JPEG without EXIF and XMP; raises ValueError where it is none."""
-    if not jpeg.startswith(_START):
-        raise ValueError("it does not begin as a JPEG")
-    return _START + _without_tags(jpeg)
-
-
 def with_comment(jpeg: bytes, text: str) -> bytes:
     """Return a JPEG with a comment (COM) after its start; raises ValueError where it is none."""
     if not jpeg.startswith(_START):
@@ -428,3 +432,98 @@ def _without_tags(jpeg: bytes) -> bytes:
             kept += segment
         at += 2 + length
     return bytes(kept) + jpeg[at:]
+
+
+Grey = npt.NDArray[np.uint8]
+
+_NO_FILTER, _UP = 0, 2  # PNG filter types
+_M_PER_INCH: Final = 0.0254  # metres per inch
+
+
+def write_png(path: Path, grey: Grey, pixel_m: float, texts: Mapping[str, str], *, smooth: bool) -> None:
+    """Write (rows, columns) grey, north up, in which 0 is transparent, as PNG.
+
+    Parameters
+    ----------
+    pixel_m : edge of a pixel (m), stated as pixels a metre.
+    texts : metadata, keyword → text (Latin 1).
+    smooth : True where lines resemble the line above them; they are then stored as differences.
+    """
+    rows, columns = grey.shape
+    lines = np.empty((rows, columns + 1), np.uint8)
+    lines[:, 0] = _UP if smooth else _NO_FILTER
+    lines[:, 1:] = grey
+    if smooth:
+        np.subtract(grey[1:], grey[:-1], out=lines[1:, 1:])
+    per_metre = round(1.0 / pixel_m)
+    with path.open("wb") as stream:
+        stream.write(PNG)
+        stream.write(_chunk(b"IHDR", struct.pack(">IIBBBBB", columns, rows, 8, 0, 0, 0, 0)))
+        stream.write(_chunk(b"tRNS", struct.pack(">H", 0)))
+        stream.write(_chunk(b"pHYs", struct.pack(">IIB", per_metre, per_metre, 1)))
+        for keyword, text in sorted(texts.items()):
+            stream.write(_chunk(b"tEXt", f"{keyword}\0{text}".encode("latin-1", "replace")))
+        stream.write(_chunk(b"IDAT", compressed(lines)))
+        stream.write(_chunk(b"IEND", b""))
+
+
+def write_bmp(path: Path, grey: Grey, pixel_m: float) -> None:
+    """Write (rows, columns) grey, north up, as an uncompressed bitmap with a palette of greys."""
+    from PIL import Image
+
+    per_inch = _M_PER_INCH / pixel_m
+    Image.fromarray(grey).save(path, format="BMP", dpi=(per_inch, per_inch))
+
+
+def world_file(transform: Affine) -> str:
+    """Return the six lines of a world file: pixel size, rotations, and the centre of the north-west pixel."""
+    x, y = transform.c + (transform.a + transform.b) / 2, transform.f + (transform.d + transform.e) / 2
+    return "".join(f"{v!r}\n" for v in (transform.a, transform.d, transform.b, transform.e, x, y))
+
+
+def check_picture(path: Path, bands: str = "L") -> None:
+    """Decode a PNG or BMP; raise :class:`StoreError` where it is incomplete.
+
+    Parameters
+    ----------
+    bands : L for grey, LA for grey and opacity.
+    """
+    from PIL import Image
+
+    try:
+        content = path.read_bytes()
+        if content.startswith(PNG):
+            _check_chunks(content)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(io.BytesIO(content), formats=("PNG", "BMP")) as picture:
+                picture.load()
+                found = picture.mode
+    except (OSError, SyntaxError, ValueError, struct.error, Image.DecompressionBombError) as error:
+        raise StoreError(f"the picture is damaged: {error}", change="make it again", file=path) from error
+    if found != bands:
+        raise StoreError(f"the picture is of the kind {found}", expected=bands, change="make it again", file=path)
+
+
+def check_world_file(path: Path) -> None:
+    """Raise :class:`StoreError` unless the file has six numbers and a positive pixel size."""
+    try:
+        numbers = [float(line) for line in path.read_text("ascii").splitlines()]
+    except ValueError as error:
+        raise StoreError("the world file holds something else than numbers", file=path) from error
+    if len(numbers) != 6 or not np.isfinite(numbers).all() or numbers[0] <= 0 or numbers[3] >= 0:
+        raise StoreError("the world file does not place a picture", change="make it again", file=path)
+
+
+def _chunk(name: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + name + body + struct.pack(">I", crc32(name + body))
+
+
+def _check_chunks(content: bytes) -> None:
+    """Check every chunk of a PNG against its checksum, because Pillow skips some of them."""
+    at = len(PNG)
+    while at < len(content):
+        (length,) = struct.unpack_from(">I", content, at)
+        if struct.unpack_from(">I", content, at + 8 + length) != (crc32(content[at + 4 : at + 8 + length]),):
+            raise ValueError(f"the checksum of the part at byte {at:,} is wrong")
+        at += 12 + length

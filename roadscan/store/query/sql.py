@@ -332,7 +332,7 @@ def _answer(connection: duckdb.DuckDBPyConnection, statement: str) -> pa.Table:
 
 
 def _batches(reader: pa.RecordBatchReader) -> Iterator[pa.RecordBatch]:
-    """Yield the batches of an answer; what fails after the first one, Arrow passes on as OSError, is DuckDB's error."""
+    """Yield the batches of an answer; raise DuckDB's error where Arrow reports one as OSError."""
     try:
         yield from reader
     except OSError as error:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.compute.kernel_options import inlined, inner, kernel
 
@@ -280,78 +277,3 @@ def sum_patches(along, surface, first_node, spacing, patch, nodes_a_patch, first
             one[8] += syz
             one[9] += szz
             k = end
-
-
-class Profiles(NamedTuple):
-    """Profiles of a coarse surface on the map."""
-
-    east_m: npt.NDArray[np.float64]
-    """(n,) easting of each profile's offset 0."""
-    north_m: npt.NDArray[np.float64]
-    """(n,) northing of it."""
-    right_east: npt.NDArray[np.float64]
-    """(n,) unit vector along the profile, to the right."""
-    right_north: npt.NDArray[np.float64]
-    """(n,)"""
-    first_node: int
-    """Number of the first node: node k lies at (first_node + k) · spacing_m."""
-    spacing_m: float
-    height_m: npt.NDArray[np.float64]
-    """(n, K) of the nodes, NaN where there is nothing."""
-    origin: npt.NDArray[np.uint8]
-    """(n, K) of the nodes."""
-    links: npt.NDArray[np.bool_]
-    """(n,) whether the surface continues from profile p to p + 1."""
-
-
-class CellSums(NamedTuple):
-    """Nodes in the cells of a square of the map; rows run north from its south-west corner."""
-
-    heights: npt.NDArray[np.int64]
-    """(e, e) in/out, Σ height, whole quanta, so that no order of profiles matters."""
-    counts: npt.NDArray[np.int32]
-    """(e, e) in/out"""
-    origins: npt.NDArray[np.uint8]
-    """(e, e) in/out, the best origin of a cell's nodes (the smallest but 0)."""
-
-
-@kernel
-def rasterise(profiles, corner, cell, pieces_per_m, quanta_per_m, found):
-    """Add the nodes of profiles to the cells of one square of the map.
-
-    Between profiles that are linked, nodes are interpolated along the road, in steps of less than a cell.
-
-    Parameters
-    ----------
-    profiles : Profiles; corner : (2,) tuple, the square's south-west corner (m); cell : float64, m.
-    pieces_per_m : float64, steps a metre between profiles; quanta_per_m : float64; found : CellSums.
-    """
-    east, north, right_east, right_north, first_node, spacing, surface, origin, links = profiles
-    sums, counts, origins = found
-    nodes, edge = surface.shape[1], sums.shape[0]
-    for p in range(east.size):
-        linked = p + 1 < east.size and links[p]
-        for k in range(nodes):
-            if origin[p, k] == NOTHING:
-                continue
-            t = (first_node + k) * spacing
-            e, n, z, kind = east[p] + t * right_east[p], north[p] + t * right_north[p], surface[p, k], origin[p, k]
-            pieces = 1
-            e_step, n_step, z_step = 0.0, 0.0, 0.0
-            if linked and origin[p + 1, k] != NOTHING:
-                e_step = east[p + 1] + t * right_east[p + 1] - e
-                n_step = north[p + 1] + t * right_north[p + 1] - n
-                z_step = surface[p + 1, k] - z
-                pieces = np.int64(np.ceil(np.sqrt(e_step * e_step + n_step * n_step) * pieces_per_m))
-                pieces = max(pieces, 1)
-            between = max(kind, origin[p + 1, k], np.uint8(INTERPOLATED)) if pieces > 1 else kind
-            for i in range(pieces):
-                share = i / pieces
-                column = np.int64(np.floor((e + share * e_step - corner[0]) / cell))
-                row = np.int64(np.floor((n + share * n_step - corner[1]) / cell))
-                if 0 <= column < edge and 0 <= row < edge:
-                    sums[row, column] += np.int64(np.floor((z + share * z_step) * quanta_per_m + 0.5))
-                    counts[row, column] += 1
-                    own = kind if i == 0 else between
-                    if origins[row, column] == NOTHING or own < origins[row, column]:
-                        origins[row, column] = own

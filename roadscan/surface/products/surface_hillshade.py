@@ -17,7 +17,7 @@ from roadscan.core.grid import TileId
 from roadscan.core.strict import Strict
 from roadscan.store.codecs import SOFTWARE
 from roadscan.store.codecs.cog import Pixels, write_sparse_cog
-from roadscan.store.codecs.grey_picture import check_picture, write_png
+from roadscan.store.codecs.image_files import check_picture, write_png
 from roadscan.surface.products.surface import (
     READS,
     SurfaceFiles,

@@ -19,7 +19,7 @@ import shapely
 from roadscan.core.crs import LOCAL_WORLD, MapFrame
 from roadscan.core.errors import ConfigError
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.core.grid import Bounds, TileId
+from roadscan.core.grid import TileId
 from roadscan.core.survey import Survey
 from roadscan.footprints.footprints import FootprintRanges
 from roadscan.formats.vectors.road_lines import place_in_map
@@ -33,8 +33,16 @@ from roadscan.formats.vectors.vector_layer import (
 )
 from roadscan.georeference.place import Placement, ProfilePoints
 from roadscan.georeference.plan.plan import SurveyPlan
-from roadscan.georeference.plan.road import looks_across, road_key
-from roadscan.georeference.sources import Georeferencer, MapSettings, RawSlice, ReadingSource, geometry_of, read_rows
+from roadscan.georeference.plan.road import looks_across
+from roadscan.georeference.sources import (
+    Georeferencer,
+    MapSettings,
+    RawSlice,
+    ReadingSource,
+    geometry_of,
+    read_rows,
+    road_key,
+)
 from roadscan.run.engine.compute import Compute, run_bundles
 from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import file_digest
@@ -44,39 +52,13 @@ from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.surface.regions import CoarseSettings, Region, Stretch, coarse_model, find_regions
 from roadscan.surface.settings import RegionSettings, SurfaceConfig
-from roadscan.surface.tile import GridWindow
+from roadscan.surface.tile import Regions
 from roadscan.tiles.product import ProductContext
 from roadscan.tiles.products.geo_table import read_geo_table, write_geo_table
 from roadscan.tiles.tasks.wanted_products import product_context
 
 _EXPECTED: Final = "a layer of polygons"
 _POLYGONS: Final = (shapely.GeometryType.POLYGON, shapely.GeometryType.MULTIPOLYGON)
-
-
-@dataclass(frozen=True)
-class Regions:
-    """Regions in which the surface is made: (n,) polygons on the map (m)."""
-
-    shapes: npt.NDArray[Any]
-
-    def near(self, *boxes: Bounds) -> Regions:
-        """Returns those that intersect one of some boxes."""
-        own = [shapely.box(b.easting_min_m, b.northing_min_m, b.easting_max_m, b.northing_max_m) for b in boxes]
-        touch = shapely.intersects(self.shapes[:, None], np.array(own, object)[None, :])
-        return Regions(self.shapes[touch.any(axis=1)])
-
-    def key(self) -> list[str]:
-        """Returns a key of their corners, all that affects a surface."""
-        return sorted(one.hex() for one in shapely.to_wkb(self.shapes))
-
-    def holds(self, window: GridWindow) -> npt.NDArray[np.bool_]:
-        """Returns a mask (rows, columns) of the cells of a window whose centre lies in one of them."""
-        easting_m, northing_m = np.meshgrid(*window.nodes_m())
-        inside = np.zeros(easting_m.shape, bool)
-        for shape in self.shapes:
-            shapely.prepare(shape)
-            inside |= shapely.intersects_xy(shape, easting_m, northing_m)
-        return inside
 
 
 def stated_regions(survey: Survey) -> Regions | None:

@@ -22,8 +22,8 @@ from roadscan.store.manifest import Manifest, OutputRecord
 from roadscan.store.store import Store
 from roadscan.surface.reconstruction import SurfaceGrid
 from roadscan.surface.settings import SurfaceConfig
-from roadscan.surface.tasks.found_regions import FoundRegions, Regions, stated_regions
-from roadscan.surface.tile import NodeColours, SurfaceTile
+from roadscan.surface.tasks.found_regions import FoundRegions, stated_regions
+from roadscan.surface.tile import NodeColours, Regions, SurfaceTile
 from roadscan.tiles.product import ProductContext, SurfaceProduct, WantedSurface, surface_file_names
 from roadscan.tiles.tasks.tile_plan import TILE, Block, TilePlan, TileTask, cut_blocks
 from roadscan.tiles.tasks.wanted_products import product_context, wanted_products, wanted_surface_products

@@ -10,9 +10,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.compute.arrays import SIGMA_OF_MAD
 from roadscan.compute.kernel_options import bare_inlined, bare_inner, kernel
 from roadscan.compute.kernels.arrays import copy_values
-from roadscan.compute.kernels.column_statistics import LANES, MAD_TO_SIGMA, OUTLIER_SIGMAS, medians_of_16
+from roadscan.compute.kernels.column_statistics import LANES, OUTLIER_SIGMAS, medians_of_16
 from roadscan.tiles.kernels.pyramid import run_end
 
 ABSENT = np.int32(2**31 - 1)
@@ -177,7 +178,7 @@ def fill_strip(cells, start, base, first_row, rows, strip, listed):
 @bare_inlined
 def reach_of(mad, floor_um):
     """Return the distance (µm) from the median within which a cell counts."""
-    return np.int32(max(OUTLIER_SIGMAS * MAD_TO_SIGMA * mad, floor_um))
+    return np.int32(max(OUTLIER_SIGMAS * SIGMA_OF_MAD * mad, floor_um))
 
 
 @bare_inlined
@@ -188,7 +189,7 @@ def large_squares(strip, patches, south, per_patch, side, slopes, base, floor_um
     out_column, _, out_height, out_intensity, out_cells, out_points, out_sloped = out
     size = -(-side * side // LANES) * LANES
     middle = 0.5 * (side - 1)
-    plain = np.int32(floor_um / (OUTLIER_SIGMAS * MAD_TO_SIGMA))  # up to this MAD the reach is the floor
+    plain = np.int32(floor_um / (OUTLIER_SIGMAS * SIGMA_OF_MAD))  # up to this MAD the reach is the floor
     residual[:] = ABSENT
     for own in range(patches.size * per_patch):
         p = own // per_patch

@@ -17,7 +17,7 @@ from roadscan.compute.array_types import Float64, Int64
 from roadscan.core.grid import TileId
 from roadscan.core.strict import Strict
 from roadscan.store.codecs.cog import Band, raster_settings, without_place_warning
-from roadscan.store.codecs.grey_picture import check_picture
+from roadscan.store.codecs.image_files import check_picture
 from roadscan.tiles.kernels.grey_pictures import shade_raster
 from roadscan.tiles.product import Cells, LoadCells, Output, ProductContext, SurveyProduct, TileSummary
 from roadscan.tiles.products.raster import (

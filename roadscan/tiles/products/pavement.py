@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 
 from roadscan.core.strict import Strict
 from roadscan.store.codecs import SOFTWARE
-from roadscan.store.codecs.grey_picture import check_picture, check_world_file, world_file, write_bmp, write_png
+from roadscan.store.codecs.image_files import check_picture, check_world_file, world_file, write_bmp, write_png
 from roadscan.tiles.cells import TileCells
 from roadscan.tiles.kernels.grey_pictures import grey_intensity, shade_cells
 from roadscan.tiles.product import ProductContext, Tile, TileProduct

@@ -21,8 +21,7 @@ from roadscan.core.survey import CellColumns
 from roadscan.footprints.footprints import FootprintRanges, footprints_of
 from roadscan.footprints.row_groups import GroupsByTile
 from roadscan.georeference.plan.plan import SurveyPlan, plan_of
-from roadscan.georeference.plan.road import CentreLines, road_key
-from roadscan.georeference.sources import MapSettings, RawSlice
+from roadscan.georeference.sources import CentreLines, MapSettings, RawSlice, road_key
 from roadscan.run.engine.compute import LazyTasks
 from roadscan.run.keys import key_of, keys_beside, keys_of
 from roadscan.run.session import Session, found_once

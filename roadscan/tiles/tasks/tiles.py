@@ -219,9 +219,7 @@ _LEAST_CELLS: Final = 20  # Least number of cells that both passes saw.
 
 
 def apart_in_tile(points: TilePoints, grid: TileGrid, passes: Sequence[LanePass]) -> list[list[Any]]:
-    """Return for each two passes of a tile: both in words, number of common cells, median difference of their mean
-    heights (m) and its scatter (m, 1 σ of a cell).
-    """
+    """Return for each pair of passes of a tile: both in words, common cells, median and 1 σ of the differences (m)."""
     ids, counts = np.unique(points.pass_id, return_counts=True)
     if ids.size < 2:
         return []

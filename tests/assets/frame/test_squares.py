@@ -14,8 +14,7 @@ from roadscan.assets.tasks.objects import clustered
 from roadscan.assets.tasks.plan import halos_of
 from roadscan.assets.tasks.tables import along_roads
 from roadscan.assets.tiling import AssetGrid, Halos
-from roadscan.condition.road_line import Lane, RoadLine
-from roadscan.condition.tasks.lines import Roads
+from roadscan.condition.road_line import Lane, RoadLine, Roads
 from roadscan.core.crs import MapFrame
 from roadscan.core.errors import ConfigError
 from roadscan.core.grid import TileGrid, TileId

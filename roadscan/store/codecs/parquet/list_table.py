@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import base64
 import functools
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO, Final, NamedTuple
@@ -20,10 +19,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.store.codecs.parquet import pages
+from roadscan.store.codecs.parquet.page_file import MAGIC, SEAL, SEAL_DIGITS, with_digits
 from roadscan.store.codecs.parquet.pages import Value, binary, boolean, i8, i16, i32, i64, listed, struct
 from roadscan.store.codecs.zlib_stream import LIBRARY, crc32
 
-MAGIC: Final = b"PAR1"
 _MOST_VALUES: Final = 1 << 28
 """Most values of a page, whose size is stated in 32 bits."""
 _VERSION: Final = 2  # format version in the footer
@@ -34,13 +33,6 @@ _CONVERTED_LIST: Final = 3  # converted type LIST (parquet.thrift)
 _LOGICAL_LIST, _LOGICAL_INTEGER = 3, 10  # logical types LIST and INTEGER (parquet.thrift)
 _UNCOMPRESSED: Final = 0  # compression codec (parquet.thrift)
 _LZ4_RAW: Final = 7  # compression codec (parquet.thrift)
-_SEAL: Final = b"roadscan.footer_crc32"
-_SEAL_DIGITS: Final = 8  # hexadecimal digits of the footer's CRC-32
-_SEALED: Final = re.compile(_SEAL + rb"\x18\x08(.{8})", re.DOTALL)
-_MARRED: Final = re.compile(
-    re.escape(_SEAL) + rb"|\x18%c.{%d}\x18\x08[0-9a-f]{8}" % (len(_SEAL), len(_SEAL)), re.DOTALL
-)
-"""What is left of such an entry where one of its bytes is another."""
 
 
 class Kind(NamedTuple):
@@ -95,22 +87,6 @@ def write_list_table(path: Path, rows: pa.Table, group_rows: int) -> None:
         writer.finish(rows.schema, rows.num_rows, groups)
 
 
-def sealed(footer: bytes) -> bool | None:
-    """Return True if a footer is as this writer left it, False if it is damaged, None if another program wrote it.
-
-    The last of the footer's entries is the CRC-32 of the footer with the CRC's digits set to 0.
-    """
-    found = list(_SEALED.finditer(footer))
-    if not found:
-        return False if _MARRED.search(footer) else None
-    digits = found[-1].span(1)
-    return b"%08x" % crc32(_with_digits(footer, digits[0], b"0" * _SEAL_DIGITS)) == footer[slice(*digits)]
-
-
-def _with_digits(footer: bytes, at: int, digits: bytes) -> bytes:
-    return footer[:at] + digits + footer[at + _SEAL_DIGITS :]
-
-
 class Writer:
     """Writes consecutive pages, and the footer with their places."""
 
@@ -141,7 +117,7 @@ class Writer:
         """Write the footer."""
         arrow = base64.b64encode(schema.serialize().to_pybytes())
         own = (schema.metadata or {}).items()
-        entries = [*own, (b"ARROW:schema", arrow), (_SEAL, b"0" * _SEAL_DIGITS)]
+        entries = [*own, (b"ARROW:schema", arrow), (SEAL, b"0" * SEAL_DIGITS)]
         fields = {
             1: i32(_VERSION),
             2: listed(list(_elements(schema))),
@@ -152,8 +128,8 @@ class Writer:
             7: listed([struct({1: struct({})})] * len(schema)),  # order of values: that of their type
         }
         footer = struct(fields).content
-        at = footer.rindex(_SEAL) + len(_SEAL) + 2
-        footer = _with_digits(footer, at, b"%08x" % crc32(footer))
+        at = footer.rindex(SEAL) + len(SEAL) + 2
+        footer = with_digits(footer, at, b"%08x" % crc32(footer))
         self._stream.write(footer + len(footer).to_bytes(4, "little") + MAGIC)
 
     def _flat(self, field: pa.Field, column: pa.Array) -> Value:

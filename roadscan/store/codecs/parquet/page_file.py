@@ -1,9 +1,13 @@
-"""Reads Parquet files that `list_table` and `number_table` wrote; any other content counts as damage."""
+"""Reads Parquet files that `list_table` and `number_table` wrote; any other content counts as damage.
+
+The footer has its CRC-32: see :func:`sealed`.
+"""
 
 from __future__ import annotations
 
 import functools
 import os
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -17,6 +21,31 @@ import pyarrow.parquet as pq
 from roadscan.store.codecs.kernels.byte_planes import LONGEST_RUN_BYTES, decode_runs
 from roadscan.store.codecs.parquet import pages
 from roadscan.store.codecs.zlib_stream import crc32
+
+MAGIC: Final = b"PAR1"  # begins and ends a Parquet file
+SEAL: Final = b"roadscan.footer_crc32"  # key of the footer's entry with its CRC-32
+SEAL_DIGITS: Final = 8  # hexadecimal digits of the footer's CRC-32
+_SEALED: Final = re.compile(SEAL + rb"\x18\x08(.{8})", re.DOTALL)
+_MARRED: Final = re.compile(re.escape(SEAL) + rb"|\x18%c.{%d}\x18\x08[0-9a-f]{8}" % (len(SEAL), len(SEAL)), re.DOTALL)
+"""What is left of such an entry where one of its bytes is another."""
+
+
+def sealed(footer: bytes) -> bool | None:
+    """Return True if a footer is as `list_table` left it, False if it is damaged, None if another program wrote it.
+
+    The last of the footer's entries is the CRC-32 of the footer with the CRC's digits set to 0.
+    """
+    found = list(_SEALED.finditer(footer))
+    if not found:
+        return False if _MARRED.search(footer) else None
+    digits = found[-1].span(1)
+    return b"%08x" % crc32(with_digits(footer, digits[0], b"0" * SEAL_DIGITS)) == footer[slice(*digits)]
+
+
+def with_digits(footer: bytes, at: int, digits: bytes) -> bytes:
+    """Return a footer with these digits of its CRC-32."""
+    return footer[:at] + digits + footer[at + SEAL_DIGITS :]
+
 
 TAIL_BYTES: Final = 8
 """Bytes of the footer's length and of the mark that ends a Parquet file."""
@@ -59,8 +88,6 @@ class _Chunk:
 
 def read_footer(stream: Any) -> tuple[pq.FileMetaData, bool]:
     """Return the footer of a Parquet file, and whether `list_table` wrote it; DamageError where it is damaged."""
-    from roadscan.store.codecs.parquet.list_table import MAGIC
-
     size = stream.seek(0, os.SEEK_END)
     tail = _read(stream, max(size - _FOOTER_BYTES, 0), size)
     length = int.from_bytes(tail[-TAIL_BYTES:-4], "little")
@@ -73,8 +100,6 @@ def read_footer(stream: Any) -> tuple[pq.FileMetaData, bool]:
 @functools.lru_cache(maxsize=_KEPT_FOOTERS)
 def _parsed(tail: bytes) -> tuple[pq.FileMetaData, bool]:
     """Return what the end of a file from its footer on says; rows of a file are read some row groups at a time."""
-    from roadscan.store.codecs.parquet.list_table import sealed
-
     ours = sealed(tail[:-TAIL_BYTES])
     if ours is False:
         raise DamageError("its footer does not have its checksum")

@@ -1,4 +1,4 @@
-"""Positions of returns from what a lidar that fires its lasers in turn wrote: azimuth of the head, distance, slot."""
+"""Positions of returns from azimuth, distance and slot, for a lidar that fires its lasers in turn."""
 
 from __future__ import annotations
 

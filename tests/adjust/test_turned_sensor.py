@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from roadscan.adjust.observations import FIXED, KINDS, MOUNTED, GaussMarkov, Mou
 from roadscan.adjust.settings import AdjustmentSettings
 from roadscan.adjust.tasks.mountings import Cause, rolls_in_words
 from roadscan.adjust.tasks.solution import rolled, turned_for_good
+from roadscan.adjust.ties.plane import Lean
 
 PITCH = 4  # of poses, and of mountings
 STATED_RAD = math.radians(0.01)
@@ -105,10 +107,12 @@ BESIDE_M = np.tile([-6.0, -2.0, 1.5, 5.0, -4.0, 3.0], 3)
 ON_GOOD_POSES = RunPrior("drive", 0, SECONDS * 10**9, (HELD, HELD, GaussMarkov(0.002, 600.0), HELD, HELD, HELD))
 
 
-def asked(observed: Observations) -> tuple[tuple[MountingPrior, ...] | None, tuple[Cause, ...]]:
+def asked(
+    observed: Observations, walls: Sequence[tuple[int, Lean]] = ()
+) -> tuple[tuple[MountingPrior, ...] | None, tuple[Cause, ...]]:
     settings = SETTINGS.model_copy(update={"estimate_variance_components": False})
     found = adjust(observed, [ON_GOOD_POSES], settings, [ROLLED], [])
-    return rolled(observed, [ON_GOOD_POSES], settings, [ROLLED], [], found, np.zeros(1, bool))
+    return rolled(observed, [ON_GOOD_POSES], settings, [ROLLED], [], found, np.zeros(1, bool), walls)
 
 
 def test_a_roll_is_found_where_it_explains_control_better_than_a_shift_of_it() -> None:
@@ -126,6 +130,15 @@ def test_a_roll_that_explains_control_as_well_as_a_shift_does_is_told() -> None:
     priors, [roll] = asked(control(0.0, (0.0, 0.6), np.tile([-3.5, 3.5], 9)))
     assert priors is None and roll.sensor == ("*", "lidar") and roll.component == ROLL
     assert "boresight roll of lidar that is off by" in rolls_in_words([roll])
+
+
+def test_walls_decide_between_a_roll_and_control_that_lies_aside() -> None:
+    observed = control(0.0, (0.0, 0.6), np.tile([-3.5, 3.5], 9))
+    _, [roll] = asked(observed)
+    leaning = Lean(0, "lidar", 40, -roll.error, math.radians(0.04))
+    priors, rolls = asked(observed, [(0, leaning)])
+    assert priors is not None and rolls == ()
+    assert asked(observed, [(0, leaning._replace(roll_rad=0.0))]) == (None, ())
 
 
 def test_right_control_asks_for_no_roll() -> None:

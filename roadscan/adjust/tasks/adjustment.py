@@ -261,23 +261,24 @@ class _Collector:
             self.mounted = self.mounted.apart((one.run, head) for one, _ in odd for head in one.heads)
         return head_findings(swapped, odd), frozenset(map(self.runs.index, useless))
 
-    def evidence(self, ties: KnownTies, control: Sequence[ControlTask]) -> Seen:
+    def evidence(self, again: Again) -> Seen:
         """Returns all evidence, with what passes see of control points and at ends of ties by hand."""
         store, manifest, hand = self.session.store, self.session.manifest, self.work.hand
-        self.lacks |= _collect_sightings(self.session, [*control, *hand.tasks])
-        points, rows = load_sightings(store, manifest, control)
+        self.lacks |= _collect_sightings(self.session, [*again.control, *hand.tasks])
+        points, rows = load_sightings(store, manifest, again.control)
         ends, _ = load_sightings(store, manifest, hand.tasks)
-        joined, unmeasured = with_hand_ties(ties, hand, ends, self.mounted, self.runs)
+        joined, unmeasured = with_hand_ties(again.ties, hand, ends, self.mounted, self.runs)
         wide = self.again.misplaced
         priors = tuple(p.widened(wide[p.run]) if p.run in wide else p for p in self.priors)
         evidence = Evidence(
-            self.runs, priors, joined, tuple(points), self.mounted, self._useless, self._pictures, self.work.points
-        )
+            self.runs, priors, joined, tuple(points), self.mounted, self._useless, self._pictures, self.work.points,
+            again.leans(self.work.tracks, self.runs),
+        )  # fmt: skip
         return Seen(evidence, rows, unmeasured)
 
-    def solve(self, ties: KnownTies, control: Sequence[ControlTask]) -> Solution:
+    def solve(self, again: Again) -> Solution:
         """Returns corrections of all runs."""
-        return solve(poses_plan_of(self.session), self.evidence(ties, control).evidence)
+        return solve(poses_plan_of(self.session), self.evidence(again).evidence)
 
 
 def adjust_survey(session: Session) -> None:
@@ -289,7 +290,7 @@ def adjust_survey(session: Session) -> None:
     mounted = mounted_of(plan, sources, foreign=bool(foreign))
     collector = _Collector(session, sources, priors_of(plan, sources, runs_of(plan)), mounted)
     work, again = collector.work, collector.again
-    seen = collector.evidence(again.ties, again.control)
+    seen = collector.evidence(again)
     doubts = [
         CORRECTED_ELSEWHERE.finds(f"run '{run}'", "its poses were corrected by another program: they are not adjusted")
         for run in sorted(foreign)
@@ -312,7 +313,7 @@ def adjust_survey(session: Session) -> None:
         return
     tools = collector.observe, collector.load, collector.solve
     again, solution, unsettled = settled(plan, sources, again, tools)
-    seen = collector.evidence(again.ties, again.control)
+    seen = collector.evidence(again)
     evidence = seen.evidence
     _forget_others(manifest, again, work)
     held = publish(session.store, solution.corrections, config)

@@ -76,6 +76,7 @@ from roadscan.adjust.tasks.mountings import (
 from roadscan.adjust.tasks.near import Sources
 from roadscan.adjust.tasks.tie_work import KnownTies
 from roadscan.adjust.tasks.tracks import span_of
+from roadscan.adjust.ties.plane import Lean
 from roadscan.compute.array_types import Bool, Float64, Int32, Int64
 from roadscan.core.witness import Finding
 from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
@@ -116,6 +117,8 @@ class Evidence:
     """Tie points and control in pictures."""
     points: tuple[ControlPoint, ...] = ()
     """Control points of the survey, by number."""
+    leans: tuple[Lean, ...] = ()
+    """Of the walls that lidars saw."""
 
     def seen_by(self, one: Sighting) -> SeenBy:
         """Returns the sensor that saw a point."""
@@ -345,7 +348,8 @@ def _adjusted(
     for _ in range(_CHANGED):
         changed = turned_for_good(joined, evidence.priors, settings, priors, cameras, found, filmed)
         if changed is None and not is_roll_asked:
-            changed, rolls = rolled(joined, evidence.priors, settings, priors, cameras, found, filmed)
+            walls = [(evidence.mounted.number(evidence.runs[one.run], one.sensor), one) for one in evidence.leans]
+            changed, rolls = rolled(joined, evidence.priors, settings, priors, cameras, found, filmed, walls)
             is_roll_asked = True
         changed = _better_stated(priors, found, filmed) if changed is None else changed
         if changed is None:
@@ -422,14 +426,17 @@ def rolled(
     cameras: Sequence[CameraPrior],
     found: Adjustment,
     filmed: Bool,
+    walls: Sequence[tuple[int, Lean]] = (),
 ) -> tuple[tuple[MountingPrior, ...] | None, tuple[Cause, ...]]:
     """Returns priors of mountings that allow a roll, where a roll of the sensors explains much better what control says
     than a shift of it in the plane, wrong points or a bad survey do; else None, and the rolls that explain it about as
     well.
 
     On a road that falls to its sides, control that lies aside and a sensor that is rolled change heights alike. What
-    counts are the weighted squares of the surveys, and of the errors that ties have in common: these would have to hide
-    the roll.
+    counts are the weighted squares of the surveys, of the errors that ties have in common, which would have to hide the
+    roll, and of the leans of walls, which would not be upright.
+
+    walls : leans of those that a lidar saw, with its number among the mountings.
     """
     none = tuple[Cause, ...]()
     verdict = found.verdict
@@ -439,7 +446,7 @@ def rolled(
     if free is None:
         return None, none
     other = adjust(observations, poses, settings, free, cameras)
-    gain = _contradiction(found) - _contradiction(other)
+    gain = _contradiction(found, walls) - _contradiction(other, walls)
     contradicted_still = other.verdict.faults or other.verdict.shift.sigmas or other.verdict.survey_factor > 1.0
     if contradicted_still or gain < -APART:
         return None, none
@@ -452,9 +459,13 @@ def rolled(
     )
 
 
-def _contradiction(found: Adjustment) -> float:
-    """Returns the weighted squares of surveys against poses and ties, and of the errors that ties have in common."""
-    return found.verdict.squares + float(found.common.error @ found.common.error)
+def _contradiction(found: Adjustment, walls: Sequence[tuple[int, Lean]]) -> float:
+    """Returns the weighted squares of surveys against poses and ties, of the errors that ties have in common, and of
+    what walls still lean.
+    """
+    roll = found.mountings.error[:, _ROLL]
+    lean = sum(((one.roll_rad + roll[number]) / one.sigma_rad) ** 2 for number, one in walls if number >= 0)
+    return found.verdict.squares + float(found.common.error @ found.common.error) + float(lean)
 
 
 def _free(priors: Sequence[MountingPrior], axes: Sequence[int], filmed: Bool) -> tuple[MountingPrior, ...] | None:

@@ -17,20 +17,21 @@ import numpy.typing as npt
 from roadscan.adjust.adjustment import MountingErrors
 from roadscan.adjust.observations import MOUNTED
 from roadscan.adjust.patches import Shift
-from roadscan.adjust.places import Place, Traverse
+from roadscan.adjust.places import Place, Track, Traverse
 from roadscan.adjust.settings import AdjustConfig, TieSettings
 from roadscan.adjust.tasks.control_work import ControlTask, sighting_tasks
 from roadscan.adjust.tasks.near import Sources
 from roadscan.adjust.tasks.solution import Solution, priors_of
 from roadscan.adjust.tasks.tie_work import KnownTies, TieTask, tie_tasks
 from roadscan.adjust.tasks.tracks import runs_of
+from roadscan.adjust.ties.plane import Lean, leans
 from roadscan.adjust.ties.tie import agreeing, is_matched, misplaced, places_of_pairs
 from roadscan.compute.array_types import Bool, Float64
 from roadscan.core.counted import counted
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
-from roadscan.georeference.sources import MountingChanges
+from roadscan.georeference.sources import MountingChanges, change_of
 from roadscan.poses.trajectory import Corrections
 
 _STILL: Final[Shift] = (0.0, 0.0, 0.0)  # No shift (m).
@@ -68,8 +69,6 @@ Observe = Callable[[Sequence[TieTask]], None]
 """Function that updates the ties of some tasks."""
 Load = Callable[[Sequence[TieTask]], KnownTies]
 """Function that returns ties of tasks that are up to date."""
-Solve = Callable[[KnownTies, Sequence[ControlTask]], Solution]
-"""Function that returns the solution of ties and of sightings of control points, whose tasks it updates first."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +96,15 @@ class Again:
     findings: tuple[Finding, ...] = ()
     """Findings on these."""
 
+    def leans(self, tracks: Sequence[Track], runs: Sequence[str]) -> tuple[Lean, ...]:
+        """Returns the leans of walls by run and lidar, in the stated mountings."""
+        found = []
+        for one in leans(self.ties.columns, tracks, runs):
+            change = change_of(self.changes, runs[one.run], one.sensor)
+            # A roll that was added to the mounting has straightened the walls by as much.
+            found.append(one if change is None else one._replace(roll_rad=one.roll_rad - change.turn_rad[0]))
+        return tuple(found)
+
     @property
     def every(self) -> tuple[TieTask, ...]:
         """Returns all tasks."""
@@ -111,6 +119,10 @@ class Again:
         told = f"ties observed again where the solution puts the passes: {', then '.join(map(str, self.counts))} places"
         told += ", with the mountings that were found, and so is control" if self.changes else ""
         return told if self.counts else ""
+
+
+Solve = Callable[[Again], Solution]
+"""Function that returns the solution of ties and of sightings of control points, whose tasks it updates first."""
 
 
 def first_ties(
@@ -143,7 +155,7 @@ def settled(
 ) -> tuple[Again, Solution, list[Finding]]:
     """Returns the solution that agrees with the positions of its ties, and what was measured for it."""
     config, (observe, load, solve) = AdjustConfig.of(plan.survey), tools
-    solution = solve(again.ties, again.control)
+    solution = solve(again)
     tied, findings = config.mode in ("joint", "vertical"), list[Finding]()
     while tied and config.again.rounds:
         changes = _changed(solution.mountings, again, config)
@@ -168,7 +180,7 @@ def settled(
             again, tasks=tasks, ties=joined, shifts={**again.shifts, **shifts}, counts=(*again.counts, len(shifts)),
             control=control, changes=changes,
         )  # fmt: skip
-        solution = solve(joined, control)
+        solution = solve(again)
     return again, solution, findings
 
 

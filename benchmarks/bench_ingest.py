@@ -40,11 +40,11 @@ from roadscan.core.survey import Survey
 from roadscan.formats.clouds.opencrg_file import CurvedRegularGrid, write_crg
 from roadscan.formats.motion.ubx import HEADER, SOLUTION
 from roadscan.formats.scanners.psi_container import PsiContainer, PsiHeader, write_psi
-from roadscan.formats.scanners.sick_telegrams import encode_scans
 from roadscan.ingest.ingest import ingest
 from roadscan.ingest.reading.format import LogSource, Reject, format_named, log_formats
 from roadscan.store.store import Store
 from tests.formats.nmea_files import Fix, sentences
+from tests.formats.sick_files import encode_scans
 
 SBET_BAR = 5.0
 """Million records a second."""

@@ -144,8 +144,12 @@ def kitti(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[P
     ):
         for one in archive:
             if one.name.endswith(".bin"):
-                archive.extract(one, folder, filter="data")
-                wanted.append(int(Path(one.name).stem))
+                stream = archive.extractfile(one)
+                assert stream is not None
+                path = folder / one.name
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_bytes(stream.read())
+                wanted.append(int(path.stem))
             if len(wanted) == 3:
                 break
     with (recordings / "kitti_drive/poses.csv").open() as stream:

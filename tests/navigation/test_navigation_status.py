@@ -242,9 +242,7 @@ def written_walk(walk: Walked, folder: Path) -> Path:
     position = walk.walk.earth.geographic_from_ecef(gnss.position_world_m)
     sigma = np.sqrt(np.einsum("nii->ni", gnss.covariance_ned_m2))
     count = gnss.epochs_gps_ns.size
-    solutions = Solutions(
-        gnss.epochs_gps_ns, position, gnss.velocity_ned_m_per_s, np.ones(count, np.int64), sigma, np.zeros((count, 3))
-    )
+    solutions = Solutions(gnss.epochs_gps_ns, position, gnss.velocity_ned_m_per_s, np.ones(count, np.int64), sigma)
     list(write_pos(solutions, raw / "gnss.pos"))
     arm = walk.vehicle.antenna_lever_arm_body_m.round(4).tolist()
     (folder / "carried.toml").write_text(WALKING_RIG.format(arm=arm))

@@ -387,8 +387,10 @@ def _better_stated(
     off = disproved(found.mountings) & ~filmed[:, None]
     if not off.any():
         return None
-    # What was found was drawn back by the stated σ, so what is off is larger.
-    sigma = np.where(off, DOUBTED * np.abs(found.mountings.error), found.mountings.prior_sigma)
+    # A turn that was found was drawn back by its stated σ: what is off is larger. Two heads share a lever arm that is
+    # off, and wider σ would let both drift.
+    times = np.where(np.isin(np.arange(len(MOUNTED)), list(TURNS.values())), DOUBTED, 1.0)
+    sigma = np.where(off, times * np.abs(found.mountings.error), found.mountings.prior_sigma)
     return tuple(replace(one, sigma=own) for one, own in zip(priors, sigma, strict=True))
 
 

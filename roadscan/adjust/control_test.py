@@ -204,9 +204,9 @@ def judged(groups: Sequence[SurveyErrors], spread: SurveyErrors, rules: Adjustme
     """
     groups, spread = [_in_datum(own, rules) for own in groups], _in_datum(spread, rules)
     found, shift = _with_shift(groups, spread, rules)
-    found = replace(found, squares=_squares(_surveyed(shift.taken_from(spread), 1.0)))
-    groups = [shift.taken_from(own) for own in groups]
-    spread, parts = shift.taken_from(spread), sum(len(own.parts()) for own in groups)
+    groups, spread = [shift.taken_from(own) for own in groups], shift.taken_from(spread)
+    found = replace(found, squares=_squares(_surveyed(spread, 1.0)))
+    parts = sum(len(own.parts()) for own in groups)
     many = parts >= _MANY and len(found.left_out) > _FEW * parts
     if not many or rules.estimate_variance_components is False:
         return found

@@ -95,8 +95,8 @@ class Seat:
     """(3,) or (n, 3) direction of its beams where all are parallel; NaN where they fan out from its origin."""
 
     @classmethod
-    def of(cls, mountings: Mountings, epochs_gps_ns: Int64, *, parallel: bool) -> Self:
-        """Return the seats (n, 3) at epochs (n,) of a sensor whose beams are all parallel, or fan out."""
+    def of(cls, mountings: Mountings, epochs_gps_ns: Int64 | int, *, parallel: bool) -> Self:
+        """Return the seats (n, 3) at epochs (n,), or (3,) at one, of a sensor whose beams are parallel, or fan out."""
         levers = np.array([one.lever_arm_body_m for one in mountings.mountings])
         beams = np.array([np.array(one.body_from_sensor)[:, 2] for one in mountings.mountings])
         at = np.searchsorted(np.array(mountings.since_gps_ns[1:], np.int64), epochs_gps_ns, side="right")
@@ -149,6 +149,11 @@ class MountingChange:
         return float(np.linalg.norm(self.lever_arm_body_m)), float(
             np.linalg.norm(self.turn_rad) + abs(self.range_scale)
         )
+
+    def moved_m(self, arm_m: float) -> float:
+        """Return how far (m) it moves a point that lies `arm_m` from the body's origin, at most."""
+        shift_m, turn_rad = self.largest
+        return shift_m + arm_m * turn_rad
 
     def applied(self, mountings: Mountings, *, parallel: bool) -> Mountings:
         """Apply the change to all mountings of a sensor; `parallel`: its beams run along its z, and only z is a range.

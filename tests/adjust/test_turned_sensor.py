@@ -10,11 +10,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from roadscan.adjust.adjustment import Adjustment, adjust
+from roadscan.adjust.adjustment import Adjustment
 from roadscan.adjust.observations import FIXED, KINDS, MOUNTED, GaussMarkov, MountingPrior, Observations, RunPrior
 from roadscan.adjust.settings import AdjustmentSettings
 from roadscan.adjust.tasks.mountings import Cause, rolls_in_words
-from roadscan.adjust.tasks.solution import rolled, turned_for_good
+from roadscan.adjust.tasks.solution import JointEvidence, rolled, turned_for_good
 from roadscan.adjust.ties.plane import Lean
 
 PITCH = 4  # of poses, and of mountings
@@ -46,8 +46,12 @@ def ties(mounted_rad: float, poses_rad: npt.NDArray[np.float64]) -> Observations
     )  # fmt: skip
 
 
+def every(observed: Observations) -> JointEvidence:
+    return JointEvidence(observed, [DRIVE], SETTINGS, (), np.zeros(1, bool))
+
+
 def adjusted(observed: Observations, prior: MountingPrior) -> Adjustment:
-    return adjust(observed, [DRIVE], SETTINGS, [prior], [])
+    return every(observed).adjusted([prior])
 
 
 def test_a_sensor_that_is_turned_for_good_explains_what_attitudes_would_be_blamed_for() -> None:
@@ -55,13 +59,13 @@ def test_a_sensor_that_is_turned_for_good_explains_what_attitudes_would_be_blame
     found = adjusted(observed, MOUNTING)
     assert abs(np.degrees(found.mountings.error[0, PITCH])) < 0.3  # the stated σ hold it back
     blamed = replace(found, variance_factors={**found.variance_factors, "pitch_rad": 80.0})
-    asked = turned_for_good(observed, [DRIVE], SETTINGS, [MOUNTING], [], blamed, np.zeros(1, bool))
+    asked = turned_for_good(every(observed), [MOUNTING], blamed)
     assert asked is not None
     turned = adjusted(observed, asked[0])
     assert turned.variance_factors["pitch_rad"] == 1.0
     assert np.degrees(turned.mountings.error[0, PITCH]) == pytest.approx(-0.4, abs=0.03)
     # A camera has evidence of its own.
-    assert turned_for_good(observed, [DRIVE], SETTINGS, [MOUNTING], [], blamed, np.ones(1, bool)) is None
+    assert turned_for_good(replace(every(observed), filmed=np.ones(1, bool)), [MOUNTING], blamed) is None
 
 
 def test_attitudes_that_wander_more_than_stated_are_no_turn_of_the_sensor() -> None:
@@ -69,13 +73,13 @@ def test_attitudes_that_wander_more_than_stated_are_no_turn_of_the_sensor() -> N
     observed = ties(0.0, wander - wander.mean())
     found = adjusted(observed, MOUNTING)
     assert found.variance_factors["pitch_rad"] > 4.0
-    assert turned_for_good(observed, [DRIVE], SETTINGS, [MOUNTING], [], found, np.zeros(1, bool)) is None
+    assert turned_for_good(every(observed), [MOUNTING], found) is None
 
 
 def test_attitudes_as_stated_ask_nothing() -> None:
     observed = ties(0.0, np.zeros(SECONDS + 1))
     found = adjusted(observed, MOUNTING)
-    assert turned_for_good(observed, [DRIVE], SETTINGS, [MOUNTING], [], found, np.zeros(1, bool)) is None
+    assert turned_for_good(every(observed), [MOUNTING], found) is None
     assert abs(np.degrees(found.mountings.error[0, PITCH])) < 0.01
 
 
@@ -111,8 +115,8 @@ def asked(
     observed: Observations, walls: Sequence[tuple[int, Lean]] = ()
 ) -> tuple[tuple[MountingPrior, ...] | None, tuple[Cause, ...]]:
     settings = SETTINGS.model_copy(update={"estimate_variance_components": False})
-    found = adjust(observed, [ON_GOOD_POSES], settings, [ROLLED], [])
-    return rolled(observed, [ON_GOOD_POSES], settings, [ROLLED], [], found, np.zeros(1, bool), walls)
+    every = JointEvidence(observed, [ON_GOOD_POSES], settings, (), np.zeros(1, bool), tuple(walls))
+    return rolled(every, [ROLLED], every.adjusted([ROLLED]))
 
 
 def test_a_roll_is_found_where_it_explains_control_better_than_a_shift_of_it() -> None:

@@ -20,7 +20,16 @@ from roadscan.adjust.patches import Shift, shifted
 from roadscan.adjust.places import Track, Traverse
 from roadscan.adjust.settings import AdjustConfig, LineUse, TargetConfig, TargetSettings
 from roadscan.adjust.targets.shapes import Chequered, Disc, Shape, SurveyedLine
-from roadscan.adjust.tasks.near import Circle, NearFile, NearReader, Remounted, Sources, near_files, remounted_of
+from roadscan.adjust.tasks.near import (
+    Circle,
+    NearFile,
+    NearReader,
+    Remounted,
+    Sources,
+    changes_key,
+    near_files,
+    remounted_of,
+)
 from roadscan.adjust.tasks.tracks import runs_of
 from roadscan.compute.arrays import way_along
 from roadscan.core.errors import ConfigError
@@ -30,7 +39,6 @@ from roadscan.core.survey import Survey
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.sources import MapSettings, MountingChanges, road_key
-from roadscan.poses.movement import Seat
 from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
@@ -310,10 +318,9 @@ def sighting_tasks(
         own = tuple(picked.get((runs[p[0].run], point.name)) for p in passes)
         sigma = tuple(_sigma_pose_m(priors[p[0].run], p[0]) for p in passes)
         read = [one.key(road_key(one.source)) for one in files]
-        changed = {sensor: one.change.values.tolist() for sensor, one in remounted_of(files, changes).items()}
         key = key_of(
             shaping, asdict(point), [[asdict(t) for t in p] for p in passes], [str(o) for o in own], sigma, read,
-            *([number, moved, *sorted(changed.items())] if number else []),
+            *([number, moved, *changes_key(files, changes)] if number else []),
         )  # fmt: skip
         tasks.append(
             ControlTask(
@@ -383,8 +390,7 @@ def _as_stated(one: Sighting, sensor: Remounted | None) -> Sighting:
     """
     if sensor is None or one.status == "unseen":
         return one
-    seats = sensor.seat(np.array([one.epoch_gps_ns], np.int64))
-    east, north, up = moved_m(one, None, (sensor.change, Seat(seats.lever_body_m[0], seats.beam_body[0]))).tolist()
+    east, north, up = moved_m(one, None, (sensor.change, sensor.seat(one.epoch_gps_ns))).tolist()
     return replace(one, easting_m=one.easting_m - east, northing_m=one.northing_m - north, height_m=one.height_m - up)
 
 

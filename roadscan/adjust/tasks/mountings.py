@@ -122,14 +122,9 @@ class Mounted:
         own = [replace(known[sensor], run=run) for run, sensor in sorted(set(heads)) if sensor in known]
         return replace(self, priors=(*self.priors, *own))
 
-    def seats(self, run: str, sensor: str, epochs_gps_ns: Int64) -> Seat:
-        """Returns stated lever arms and directions of the beams (n, 3) at epochs."""
+    def seats(self, run: str, sensor: str, epochs_gps_ns: Int64 | int) -> Seat:
+        """Returns stated lever arms and directions of the beams, (n, 3) at epochs, (3,) at one."""
         return Seat.of(self.stated[run, sensor], epochs_gps_ns, parallel=(run, sensor) in self.parallel)
-
-    def seat(self, run: str, sensor: str, epoch_gps_ns: int) -> Seat:
-        """Returns the same at one epoch, (3,)."""
-        found = self.seats(run, sensor, np.array([epoch_gps_ns], np.int64))
-        return Seat(found.lever_body_m[0], found.beam_body[0])
 
 
 def mounted_of(plan: SurveyPlan, sources: Sources, *, foreign: bool) -> Mounted:
@@ -220,9 +215,7 @@ def _values(row: Mapping[str, Any]) -> Float64:
 
 
 def _stays(row: Mapping[str, Any], error: Float64, config: AdjustConfig) -> bool:
-    away = error - _values(row)
-    turned = np.linalg.norm(away[3:6]) + abs(away[6])
-    return bool(np.linalg.norm(away[:3]) + config.moved_arm_m * turned <= config.moved_m)
+    return MountingChange.of(error - _values(row)).moved_m(config.moved_arm_m) <= config.moved_m
 
 
 def _row(found: MountingErrors, k: int) -> dict[str, Any]:

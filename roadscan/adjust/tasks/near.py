@@ -122,8 +122,8 @@ class Remounted(NamedTuple):
     parallel: bool
     """Whether its beams are."""
 
-    def seat(self, epochs_gps_ns: Int64) -> Seat:
-        """Returns the stated seats (n, 3) at epochs (n,)."""
+    def seat(self, epochs_gps_ns: Int64 | int) -> Seat:
+        """Returns the stated seats (n, 3) at epochs (n,), or (3,) at one."""
         return Seat.of(self.stated, epochs_gps_ns, parallel=self.parallel)
 
 
@@ -135,6 +135,11 @@ def remounted_of(files: Sequence[NearFile], changes: MountingChanges) -> dict[tu
         if change is not None:
             found[source.run, source.sensor] = Remounted(change, source.mountings, source.has_parallel_beams)
     return found
+
+
+def changes_key(files: Sequence[NearFile], changes: MountingChanges) -> list[tuple[tuple[str, str], list[float]]]:
+    """Returns what the changes of mountings add to the key of what is read from files."""
+    return sorted((sensor, one.change.values.tolist()) for sensor, one in remounted_of(files, changes).items())
 
 
 def memory_of(sources: Sources) -> int:

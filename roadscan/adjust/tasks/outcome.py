@@ -269,7 +269,7 @@ def _mounting(evidence: Evidence, end: Traverse, changes: MountingChanges) -> tu
     change = change_of(changes, run, end.sensor)
     if change is None:
         return None
-    return change, evidence.mounted.seat(run, end.sensor, end.first_gps_ns)
+    return change, evidence.mounted.seats(run, end.sensor, end.first_gps_ns)
 
 
 def view_seam(task: SeamTask) -> SeamView | None:

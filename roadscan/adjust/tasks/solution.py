@@ -124,8 +124,26 @@ class Evidence:
         """Returns the sensor that saw a point."""
         if one.status == "unseen":
             return SeenBy(-1, NO_SEAT)
-        seat = self.mounted.seat(self.runs[one.run], one.sensor, one.epoch_gps_ns)
+        seat = self.mounted.seats(self.runs[one.run], one.sensor, one.epoch_gps_ns)
         return SeenBy(self.mounted.number(self.runs[one.run], one.sensor), seat)
+
+
+@dataclass(frozen=True)
+class JointEvidence:
+    """What is adjusted together; σ of mountings are changed, and it is adjusted again."""
+
+    observations: Observations
+    poses: Sequence[RunPrior]
+    settings: AdjustmentSettings
+    cameras: tuple[CameraPrior, ...]
+    filmed: Bool
+    """(s,) mountings that are those of cameras."""
+    walls: tuple[tuple[int, Lean], ...] = ()
+    """Leans of the walls that a lidar saw, with its number among the mountings; −1: it is none of them."""
+
+    def adjusted(self, mountings: Sequence[MountingPrior]) -> Adjustment:
+        """Returns the adjustment with some σ of mountings."""
+        return adjust(self.observations, self.poses, self.settings, mountings, self.cameras)
 
 
 @dataclass(frozen=True)
@@ -343,19 +361,20 @@ def _adjusted(
         joined = Observations.joined([joined, *more, approach.rows.observations])
         cameras = list(evidence.pictures.cameras)
     filmed = np.array([one.sensor in evidence.mounted.cameras for one in priors], bool)
-    found, rolls = adjust(joined, evidence.priors, settings, priors, cameras), tuple[Cause, ...]()
+    walls = tuple((evidence.mounted.number(evidence.runs[one.run], one.sensor), one) for one in evidence.leans)
+    every = JointEvidence(joined, evidence.priors, settings, tuple(cameras), filmed, walls)
+    found, rolls = every.adjusted(priors), tuple[Cause, ...]()
     is_roll_asked = False
     for _ in range(_CHANGED):
-        changed = turned_for_good(joined, evidence.priors, settings, priors, cameras, found, filmed)
+        changed = turned_for_good(every, priors, found)
         if changed is None and not is_roll_asked:
-            walls = [(evidence.mounted.number(evidence.runs[one.run], one.sensor), one) for one in evidence.leans]
-            changed, rolls = rolled(joined, evidence.priors, settings, priors, cameras, found, filmed, walls)
+            changed, rolls = rolled(every, priors, found)
             is_roll_asked = True
         changed = _better_stated(priors, found, filmed) if changed is None else changed
         if changed is None:
             break
         priors = changed
-        found = adjust(joined, evidence.priors, settings, priors, cameras)
+        found = every.adjusted(priors)
     stated = np.array([one.sigma for one in evidence.mounted.priors]).reshape(-1, len(MOUNTED))
     estimated, wrong = found.mountings, filmed.copy()  # pictures show a mounting whether or not it contradicts
     wrong[~filmed] = contradicted(found.mountings.of(~filmed))
@@ -365,7 +384,7 @@ def _adjusted(
             replace(one, sigma=one.sigma if is_wrong else np.zeros(len(MOUNTED)))
             for one, is_wrong in zip(priors, wrong, strict=True)
         )
-        found = adjust(joined, evidence.priors, settings, priors, cameras)
+        found = every.adjusted(priors)
         estimated = replace(
             estimated,
             error=np.where(wrong[:, None], found.mountings.error, 0.0),
@@ -395,13 +414,7 @@ def _better_stated(
 
 
 def turned_for_good(
-    observations: Observations,
-    poses: Sequence[RunPrior],
-    settings: AdjustmentSettings,
-    priors: Sequence[MountingPrior],
-    cameras: Sequence[CameraPrior],
-    found: Adjustment,
-    filmed: Bool,
+    every: JointEvidence, priors: Sequence[MountingPrior], found: Adjustment
 ) -> tuple[MountingPrior, ...] | None:
     """Returns priors of mountings that allow a sensor to be turned about each axis whose stated σ of the poses would be
     much too small, where the poses are as stated once it is turned; None where they are not.
@@ -411,24 +424,17 @@ def turned_for_good(
     they widen the process of the poses until this takes up the turn.
     """
     wide = [axis for name, axis in TURNS.items() if found.variance_factors[name] > _MUCH_TOO_SMALL]
-    free = _free(priors, wide, filmed)
+    free = _free(priors, wide, every.filmed)
     if free is None:
         return None
-    turned = adjust(observations, poses, settings, free, cameras)
+    turned = every.adjusted(free)
     if any(turned.variance_factors[name] > 1.0 for name, axis in TURNS.items() if axis in wide):
         return None
     return _allowed(priors, free, turned)
 
 
 def rolled(
-    observations: Observations,
-    poses: Sequence[RunPrior],
-    settings: AdjustmentSettings,
-    priors: Sequence[MountingPrior],
-    cameras: Sequence[CameraPrior],
-    found: Adjustment,
-    filmed: Bool,
-    walls: Sequence[tuple[int, Lean]] = (),
+    every: JointEvidence, priors: Sequence[MountingPrior], found: Adjustment
 ) -> tuple[tuple[MountingPrior, ...] | None, tuple[Cause, ...]]:
     """Returns priors of mountings that allow a roll, where a roll of the sensors explains much better what control says
     than a shift of it in the plane, wrong points or a bad survey do; else None, and the rolls that explain it about as
@@ -437,18 +443,16 @@ def rolled(
     On a road that falls to its sides, control that lies aside and a sensor that is rolled change heights alike. What
     counts are the weighted squares of the surveys, of the errors that ties have in common, which would have to hide the
     roll, and of the leans of walls, which would not be upright.
-
-    walls : leans of those that a lidar saw, with its number among the mountings.
     """
     none = tuple[Cause, ...]()
     verdict = found.verdict
     if not verdict.shift.sigmas and len(verdict.wrong) < _SEVERAL and verdict.survey_factor == 1.0:
         return None, none
-    free = _free(priors, [_ROLL], filmed)
+    free = _free(priors, [_ROLL], every.filmed)
     if free is None:
         return None, none
-    other = adjust(observations, poses, settings, free, cameras)
-    gain = _contradiction(found, walls) - _contradiction(other, walls)
+    other = every.adjusted(free)
+    gain = _contradiction(found, every.walls) - _contradiction(other, every.walls)
     contradicted_still = other.verdict.faults or other.verdict.shift.sigmas or other.verdict.survey_factor > 1.0
     if contradicted_still or gain < -APART:
         return None, none
@@ -457,7 +461,7 @@ def rolled(
     errors = other.mountings
     return None, tuple(
         Cause(errors.sensors[k], _ROLL, float(errors.error[k, _ROLL]), float(errors.sigma[k, _ROLL]))
-        for k in np.flatnonzero((errors.prior_sigma[:, _ROLL] >= _WIDE_RAD) & ~filmed).tolist()
+        for k in np.flatnonzero((errors.prior_sigma[:, _ROLL] >= _WIDE_RAD) & ~every.filmed).tolist()
     )
 
 

@@ -17,7 +17,7 @@ from roadscan.adjust.patches import PassReadings, Shift, shifted
 from roadscan.adjust.places import Place, Traverse
 from roadscan.adjust.settings import TieSettings
 from roadscan.adjust.tasks.mountings import CHANCE, DETERMINED, Mounted
-from roadscan.adjust.tasks.near import Circle, NearFile, NearReader, Sources, near_files, remounted_of
+from roadscan.adjust.tasks.near import Circle, NearFile, NearReader, Sources, changes_key, near_files, remounted_of
 from roadscan.adjust.ties.at_place import Ties, ties_at
 from roadscan.adjust.ties.tie import HEIGHT, LASERS, SAME_PASS
 from roadscan.core.gpstime import NS_PER_S
@@ -107,8 +107,7 @@ def tie_tasks(
         own, moved = tuple(places[start : start + _PLACES]), tuple(shifts[start : start + _PLACES])
         files = tuple(near_files(sources, [t for place in own for t in place.traverses], runs))
         seen = [one.key(road_key(one.source)) for one in files]
-        changed = {sensor: one.change.values.tolist() for sensor, one in remounted_of(files, changes).items()}
-        later = [number, moved, *sorted(changed.items())] if number else []
+        later = [number, moved, *changes_key(files, changes)] if number else []
         key = key_of(shaping, [asdict(place) for place in own], seen, *later)
         tasks.append(TieTask(plan.store, plan.ground, settings, runs, own, files, key, number, moved, changes))
     return tasks

@@ -32,9 +32,11 @@ from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.sources import MountingChanges, change_of
+from roadscan.poses.movement import MountingChange
 from roadscan.poses.trajectory import Corrections
 
 _STILL: Final[Shift] = (0.0, 0.0, 0.0)  # No shift (m).
+_UNCHANGED: Final = MountingChange.of(np.zeros(len(MOUNTED)))
 _REMOUNTED_M: Final = 0.01
 """A mounting is off by much where it moves a point so far (m) that lies `adjust.moved_arm_m` away: returns of a lidar
 from before and from behind a place then lie farther apart than their noise, and a height is not the mean of both."""
@@ -190,11 +192,8 @@ def _changed(found: MountingErrors | None, again: Again, config: AdjustConfig) -
     """
     changes = {} if found is None else {sensor: one.rounded(_CHANGE_STEPS) for sensor, one in found.changes.items()}
     for sensor in {*changes, *again.changes}:
-        none = np.zeros(len(MOUNTED))
-        now, before = (none if (one := own.get(sensor)) is None else one.values for own in (changes, again.changes))
-        moved = np.abs(now - before)
-        turned = float(np.linalg.norm(moved[3:6]) + moved[6])
-        if float(np.linalg.norm(moved[:3])) + config.moved_arm_m * turned > _REMOUNTED_M:
+        now, before = (own.get(sensor, _UNCHANGED).values for own in (changes, again.changes))
+        if MountingChange.of(now - before).moved_m(config.moved_arm_m) > _REMOUNTED_M:
             return changes
     return again.changes
 

@@ -483,7 +483,7 @@ def leans(columns: Mapping[str, npt.NDArray[Any]], tracks: Sequence[Track], runs
     within = (columns["kind"] == PLANE) & (columns["first_run"] == columns["second_run"])
     within &= columns["first_sensor"] == columns["second_sensor"]
     within &= (np.abs(columns["direction_down"]) < np.sin(_STEEP_RAD)) & (np.abs(columns["first_by_right"]) > _ALONG)
-    within &= _above_ground_m(columns) > _ABOVE_M
+    within[within] = _above_ground_m(columns, within) > _ABOVE_M
     found = []
     for track in tracks:
         own = within & (columns["first_run"] == runs[track.run]) & (columns["first_sensor"] == track.sensor)
@@ -495,13 +495,18 @@ def leans(columns: Mapping[str, npt.NDArray[Any]], tracks: Sequence[Track], runs
     return found
 
 
-def _above_ground_m(columns: Mapping[str, npt.NDArray[Any]]) -> Float64:
-    """Returns the heights (n,) of plane ties above the ground of their place; NaN where no plane of the ground is."""
-    level, place = np.abs(columns["direction_down"]) > _LEVEL, columns["place"]
-    ground_m = np.full(place.size, np.nan)
-    for one in np.unique(place[level]):
-        ground_m[place == one] = np.median(columns["height_m"][level & (place == one)])
-    return np.asarray(columns["height_m"] - ground_m)
+def _above_ground_m(columns: Mapping[str, npt.NDArray[Any]], which: Bool) -> Float64:
+    """Returns the heights (w,) of some ties above the ground of their place; NaN where no tie of the ground is."""
+    level = np.flatnonzero(np.abs(columns["direction_down"]) > _LEVEL)
+    rising = level[np.lexsort((columns["height_m"][level], columns["place"][level]))]
+    places, first, count = np.unique(columns["place"][rising], return_index=True, return_counts=True)
+    height_m = columns["height_m"][rising]
+    if not places.size:
+        return np.full(int(which.sum()), np.nan)
+    ground_m = 0.5 * (height_m[first + (count - 1) // 2] + height_m[first + count // 2])
+    place = columns["place"][which]
+    at = np.searchsorted(places, place).clip(max=places.size - 1)
+    return np.where(places[at] == place, columns["height_m"][which] - ground_m[at], np.nan)
 
 
 def _lean(track: Track, walls: Mapping[str, npt.NDArray[Any]]) -> Lean | None:

@@ -37,8 +37,7 @@ from roadscan.adjust.sparse_normal import Rows
 from roadscan.adjust.unknowns import HEIGHT_ALONE, ControlPoints, FixedRun, Unknowns, directions_of, fixed_runs
 from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.pictures.lens import PARAMETERS
-from roadscan.poses.movement import MountingChange
-from roadscan.poses.trajectory import Corrections
+from roadscan.poses.trajectory import Corrections, MountingChange
 
 _DOWN: Final = COMPONENTS.index("down_m")
 _AT_ONCE: Final = 200

@@ -9,11 +9,10 @@ from typing import Final, Literal
 import numpy as np
 
 from roadscan.adjust.observations import FIXED, KINDS, MOUNTED, Observations, mount_partials, partials
-from roadscan.adjust.patches import PassReadings, level_from_map, map_from_level
-from roadscan.adjust.places import Track, Traverse
+from roadscan.adjust.places import PassReadings, Track, Traverse, level_from_map, map_from_level
 from roadscan.adjust.settings import TargetSettings
 from roadscan.adjust.targets.find import find_target
-from roadscan.adjust.targets.line import find_line
+from roadscan.adjust.targets.fit import find_line
 from roadscan.adjust.targets.shapes import (
     ExpectedTarget,
     HeightFind,
@@ -27,8 +26,7 @@ from roadscan.compute.array_types import Float64
 from roadscan.compute.arrays import scatter_about
 from roadscan.core.counted import listed
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.poses.movement import MountingChange, Seat
-from roadscan.poses.trajectory import Corrections
+from roadscan.poses.trajectory import Corrections, MountingChange, Seat
 
 SightStatus = Literal["found", "missed", "doubled", "moved", "picked", "height", "unseen"]
 """`height`: no target is looked for, the height alone was measured; `unseen`: not even that, or the pass did not see

@@ -17,7 +17,7 @@ import scipy
 from roadscan.adjust.adjustment import ControlErrors
 from roadscan.adjust.control import Sighting
 from roadscan.adjust.control_test import quantile
-from roadscan.adjust.patches import level_from_map
+from roadscan.adjust.places import level_from_map
 from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.errors import ConfigError
 from roadscan.poses.trajectory import Corrections

@@ -42,7 +42,7 @@ from roadscan.compute.arrays import runs_of
 from roadscan.core.errors import ConfigError
 from roadscan.core.gpstime import NS_PER_S
 from roadscan.pictures.lens import COLUMNS
-from roadscan.poses.movement import Seat
+from roadscan.poses.trajectory import Seat
 
 KINDS: Final = (
     "height_tie", "shift_tie", "plane_tie", "control_height", "control_position", "head_tie", "hand_tie",

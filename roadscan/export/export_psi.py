@@ -23,7 +23,7 @@ from roadscan.formats.scanners.psi_container import PsiContainer, PsiHeader, wri
 from roadscan.georeference.plan.plan import SurveyPlan, plan_survey
 from roadscan.georeference.sources import ReadingSource, read_rows
 from roadscan.navigation.tasks.trajectories import load_trajectory
-from roadscan.poses.movement import Travel
+from roadscan.poses.trajectory import Travel
 from roadscan.store.logs import DataFile
 from roadscan.store.store import Store
 

@@ -17,8 +17,7 @@ from roadscan.georeference.charts import Charts, georeference_of
 from roadscan.georeference.kernels.reach import SpannedProfiles, reach_of_profiles, reach_of_returns
 from roadscan.georeference.kernels.readings import Georeference, Limits
 from roadscan.georeference.kernels.tile_set import block_ranges
-from roadscan.poses.movement import NO_CORRECTION, Allowance
-from roadscan.poses.trajectory import Trajectory
+from roadscan.poses.trajectory import NO_CORRECTION, Allowance, Trajectory
 
 PIECE_M: Final = 1.0
 """Profiles are cut into pieces of about this width at their farthest reading."""

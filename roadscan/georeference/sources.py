@@ -34,8 +34,7 @@ from roadscan.georeference.place import (
 from roadscan.georeference.road_profiles import TICK_NS, WINDOW_NS, RoadFinder
 from roadscan.ingest.clock_correction import ClockCorrection
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded, load_trajectory
-from roadscan.poses.movement import NO_CORRECTION, Allowance, MountingChange
-from roadscan.poses.trajectory import Trajectory
+from roadscan.poses.trajectory import NO_CORRECTION, Allowance, MountingChange, Trajectory
 from roadscan.store.logs import DataFile
 from roadscan.store.readings.row_groups import distances_m, read_groups
 from roadscan.store.schema import table_schema

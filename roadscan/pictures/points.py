@@ -22,7 +22,7 @@ from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store, alone_in
 
-TABLE: Final = "picture_points"
+POINTS: Final = "picture_points"
 _CONTROL: Final = "control_points"
 _CSV_DIGITS: Final = 4  # digits of pixels in a file
 
@@ -47,7 +47,7 @@ def measured_points(store: Store, records: Sequence[LogRecord], rig: Rig) -> Mea
     kept: dict[tuple[str, str, str, str], dict[str, Any]] = {}
     faults: Counter[str] = Counter()
     for record in records:
-        for file in record.tables.get(TABLE, ()):
+        for file in record.tables.get(POINTS, ()):
             for row in read_groups(store, file.path, range(len(file.group_rows))).to_pylist():
                 meant = _meant(row, record, known)
                 if len(meant) != 1:
@@ -63,7 +63,7 @@ def measured_points(store: Store, records: Sequence[LogRecord], rig: Rig) -> Mea
                 kept[place] = row | {"run": run, "sensor": sensor}
     ordered = [kept[place] for place in sorted(kept)]
     notes = tuple(f"{text}: {n:,} measurement{'s' * (n > 1)} left out" for text, n in sorted(faults.items()))
-    return MeasuredPoints(pa.Table.from_pylist(ordered, schema=table_schema(TABLE).arrow()), notes)
+    return MeasuredPoints(pa.Table.from_pylist(ordered, schema=table_schema(POINTS).arrow()), notes)
 
 
 def control_rows(store: Store, records: Sequence[LogRecord]) -> list[dict[str, Any]]:
@@ -150,7 +150,7 @@ class ClickedPoints:
         ConfigError
             where the file has other columns, or values that are none.
         """
-        schema = table_schema(TABLE).arrow()
+        schema = table_schema(POINTS).arrow()
         if not self.file.exists():
             return []
         options = pa_csv.ConvertOptions(column_types=schema, strings_can_be_null=True, null_values=[""])
@@ -193,7 +193,7 @@ class ClickedPoints:
                     {"run": run, "sensor": sensor, "picture": picture, "point": point, "u_px": float(pixel[0]),
                      "v_px": float(pixel[1]), "sigma_px": None, "source": BY_HAND}
                 )  # fmt: skip
-            table = pa.Table.from_pylist(sorted(rows, key=_order), schema=table_schema(TABLE).arrow())
+            table = pa.Table.from_pylist(sorted(rows, key=_order), schema=table_schema(POINTS).arrow())
             write_points(table, self.file)
             return self.rows()
 

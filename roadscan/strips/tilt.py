@@ -18,7 +18,7 @@ import numpy as np
 from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.arrays import scatter_about
 from roadscan.core.gpstime import NS_PER_S
-from roadscan.poses.movement import LevelPoses
+from roadscan.poses.trajectory import LevelPoses
 
 Angle = Literal["roll", "pitch"]
 

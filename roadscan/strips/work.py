@@ -29,8 +29,7 @@ from roadscan.georeference.sources import (
     road_key,
 )
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded, median_pose_sigma
-from roadscan.poses.movement import level_poses
-from roadscan.poses.trajectory import Trajectory
+from roadscan.poses.trajectory import Trajectory, level_poses
 from roadscan.run.engine.compute import run_bundles
 from roadscan.run.keys import code_digest, key_of
 from roadscan.run.session import Session

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from roadscan.adjust.patches import PassReadings
-from roadscan.adjust.places import Place, Traverse
+from roadscan.adjust.places import PassReadings, Place, Traverse
 from roadscan.simulate.surface import texture_field
 
 EASTING_M, NORTHING_M, HEADING_RAD = 512_345.0, 5_012_345.0, 0.3

@@ -18,8 +18,7 @@ from roadscan.adjust.control import (
     sight,
     swapped,
 )
-from roadscan.adjust.patches import PassReadings
-from roadscan.adjust.places import Track
+from roadscan.adjust.places import PassReadings, Track
 from roadscan.adjust.settings import TargetSettings
 from roadscan.adjust.tasks.publication import left_after
 from roadscan.core.frames import rotation_from_rph

@@ -9,8 +9,7 @@ import pytest
 
 from roadscan.adjust.adjustment import adjust
 from roadscan.adjust.observations import COMMON, KINDS, GaussMarkov, Observations, RunPrior
-from roadscan.adjust.patches import PassReadings
-from roadscan.adjust.places import Place, Traverse
+from roadscan.adjust.places import PassReadings, Place, Traverse
 from roadscan.adjust.settings import AdjustmentSettings, TieSettings
 from roadscan.adjust.ties.at_place import Ties, ties_at
 

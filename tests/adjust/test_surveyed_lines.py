@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from roadscan.adjust.settings import TargetSettings
-from roadscan.adjust.targets.line import find_line
+from roadscan.adjust.targets.fit import find_line
 from roadscan.adjust.targets.shapes import SurveyedLine, TargetReadings
 
 SETTINGS = TargetSettings(search_radius_m=0.5)

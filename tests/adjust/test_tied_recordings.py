@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from roadscan.adjust.adjustment import Adjustment, adjust
 from roadscan.adjust.observations import KINDS, GaussMarkov, Observations, RunPrior
-from roadscan.adjust.patches import PassReadings
-from roadscan.adjust.places import Place, Track, places_of_overlap
+from roadscan.adjust.places import PassReadings, Place, Track, places_of_overlap
 from roadscan.adjust.settings import AdjustmentSettings, PlaceSettings, TieSettings
 from roadscan.adjust.ties.at_place import Ties, ties_at
 

@@ -16,8 +16,7 @@ from roadscan.core.rig import Mountings, ScanGeometry, Sensor
 from roadscan.georeference.charts import charts_along
 from roadscan.georeference.place import HeightLimits, Placement
 from roadscan.georeference.reach import RangeSpans, Reach, Touched
-from roadscan.poses.movement import Allowance
-from roadscan.poses.trajectory import Corrections, Trajectory
+from roadscan.poses.trajectory import Allowance, Corrections, Trajectory
 
 TILE_QUANTA = 100_000
 """Tiles of 1 m: many edges to get wrong."""

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.adjust.tasks.tracks import swath_of
 from roadscan.core.crs import MapFrame, grid_convergence_rad
-from roadscan.poses.movement import LevelPoses, level_poses
-from roadscan.poses.trajectory import Trajectory
+from roadscan.poses.trajectory import LevelPoses, Trajectory, level_poses
 
 LON, LAT = 11.4, 48.2
 HEADING = np.radians([37.0, 37.5, 38.0, 38.5, 39.0])

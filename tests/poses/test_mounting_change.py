@@ -8,7 +8,7 @@ import pytest
 from roadscan.adjust.observations import mount_partials
 from roadscan.core.frames import rotation_from_rph
 from roadscan.core.rig import Mounting, Mountings
-from roadscan.poses.movement import MountingChange, Seat
+from roadscan.poses.trajectory import MountingChange, Seat
 
 VALUES = np.array([0.0003, -0.0002, 0.0004, 2e-5, -3e-5, 4e-5, 8e-5])
 ROTATION, LEVER = rotation_from_rph(0.2, -0.1, 0.3), np.array([-1.2, 0.8, -1.1])

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.poses.movement import NO_CORRECTION, Allowance, allowance_for
-from roadscan.poses.trajectory import Corrections
+from roadscan.poses.trajectory import NO_CORRECTION, Allowance, Corrections, allowance_for
 
 
 def corrections(north_m: float, down_m: float, roll_rad: float) -> Corrections:

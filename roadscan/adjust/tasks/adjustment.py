@@ -15,12 +15,14 @@ from roadscan.adjust.observations import RunPrior
 from roadscan.adjust.places import Place, Track, places_of_overlap
 from roadscan.adjust.quality import NSSDA_CHECK_POINTS, AdjustmentPicture, Residuals
 from roadscan.adjust.settings import AdjustConfig, PlaceSettings
-from roadscan.adjust.tasks.bundle import AskedOfPictures, pictures_key, pictures_of
 from roadscan.adjust.tasks.cameras import (
+    AskedOfPictures,
     camera_findings,
     picture_findings,
     picture_lines,
     picture_rows,
+    pictures_key,
+    pictures_of,
     publish_cameras,
 )
 from roadscan.adjust.tasks.control_work import (
@@ -101,7 +103,7 @@ from roadscan.core.witness import Finding
 from roadscan.georeference.plan.plan import SurveyPlan, poses_plan_of
 from roadscan.georeference.sources import road_key
 from roadscan.navigation.tasks.recorded_pictures import NOT_DRAWN
-from roadscan.poses.movement import largest
+from roadscan.poses.trajectory import largest
 from roadscan.run.engine.compute import run_bundles
 from roadscan.run.keys import code_digest, key_of
 from roadscan.run.session import Session

@@ -16,8 +16,7 @@ import shapely
 
 from roadscan.adjust.control import ControlPoint, PickedPlace, Sighting, WrongPoint, moved_m, passes_by, sight_shifted
 from roadscan.adjust.observations import RunPrior
-from roadscan.adjust.patches import Shift, shifted
-from roadscan.adjust.places import Track, Traverse
+from roadscan.adjust.places import Shift, Track, Traverse, shifted
 from roadscan.adjust.settings import AdjustConfig, LineUse, TargetConfig, TargetSettings
 from roadscan.adjust.targets.shapes import Chequered, Disc, Shape, SurveyedLine
 from roadscan.adjust.tasks.near import (

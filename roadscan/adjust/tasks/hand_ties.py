@@ -21,8 +21,7 @@ from roadscan.adjust.adjustment import Adjustment
 from roadscan.adjust.control import ControlPoint, Sighting
 from roadscan.adjust.control_test import quantile
 from roadscan.adjust.observations import KINDS, MOUNTED, Observations, RunPrior, mount_partials, partials
-from roadscan.adjust.patches import level_from_map
-from roadscan.adjust.places import Track, Traverse
+from roadscan.adjust.places import Track, Traverse, level_from_map
 from roadscan.adjust.settings import AdjustConfig, HandTies
 from roadscan.adjust.tasks.control_work import HAND, ControlTask, passes_of, sighting_tasks
 from roadscan.adjust.tasks.mountings import Mounted

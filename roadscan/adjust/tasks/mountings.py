@@ -29,7 +29,7 @@ from roadscan.georeference.sources import (
     mounting_change_of,
 )
 from roadscan.pictures.settings import PictureTiesConfig
-from roadscan.poses.movement import MountingChange, Seat
+from roadscan.poses.trajectory import MountingChange, Seat
 from roadscan.store.small_tables import read_small, small_path, write_small
 from roadscan.store.store import Store
 

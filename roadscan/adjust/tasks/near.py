@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from roadscan.adjust.patches import PassReadings
-from roadscan.adjust.places import Traverse
+from roadscan.adjust.places import PassReadings, Traverse
 from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.grid import QUANTA_PER_M
 from roadscan.core.rig import Mountings, ScanGeometry
@@ -28,7 +27,7 @@ from roadscan.georeference.sources import (
     geometry_of,
     read_rows,
 )
-from roadscan.poses.movement import LevelPoses, MountingChange, Seat, level_poses
+from roadscan.poses.trajectory import LevelPoses, MountingChange, Seat, level_poses
 from roadscan.run.stage import BYTES_PER_READING, WORKER_BASE_BYTES
 from roadscan.store.logs import DataFile
 from roadscan.store.store import Store

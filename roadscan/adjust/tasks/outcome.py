@@ -15,8 +15,7 @@ import pyarrow as pa
 
 from roadscan.adjust.bundle.outcome import CameraResiduals, draw_residuals
 from roadscan.adjust.observations import KINDS
-from roadscan.adjust.patches import PassReadings, Patch, map_from_level, patch_of
-from roadscan.adjust.places import Place, Traverse
+from roadscan.adjust.places import PassReadings, Patch, Place, Traverse, map_from_level, patch_of
 from roadscan.adjust.quality import AdjustmentPicture, ShownSeam, draw_adjustment, draw_seams
 from roadscan.adjust.settings import TieSettings
 from roadscan.adjust.tasks.near import Circle, NearReader
@@ -29,8 +28,7 @@ from roadscan.core.extras import can_draw
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.sources import MountingChanges, change_of
 from roadscan.navigation.tasks.recorded_pictures import NOT_DRAWN, keep_file
-from roadscan.poses.movement import MountingChange, Seat
-from roadscan.poses.trajectory import Corrections
+from roadscan.poses.trajectory import Corrections, MountingChange, Seat
 from roadscan.run.engine.compute import Compute, reason_of
 from roadscan.run.keys import key_of
 from roadscan.store.codecs.image_files import write_png

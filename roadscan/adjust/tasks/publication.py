@@ -28,8 +28,7 @@ from roadscan.adjust.tasks.solution import Evidence, Solution
 from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.arrays import way_along
 from roadscan.navigation.tasks.trajectories import CORRECTION_SIGMAS, load_all_corrections
-from roadscan.poses.movement import MountingChange
-from roadscan.poses.trajectory import Corrections
+from roadscan.poses.trajectory import Corrections, MountingChange
 from roadscan.store.small_tables import read_small, small_path, write_small
 from roadscan.store.store import Store
 

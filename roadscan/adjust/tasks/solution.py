@@ -36,11 +36,11 @@ from roadscan.adjust.observations import (
     StatedSigma,
     knots_of,
 )
-from roadscan.adjust.patches import level_from_map
+from roadscan.adjust.places import level_from_map
 from roadscan.adjust.quality import LeaveOneOut, leave_one_out
 from roadscan.adjust.settings import AdjustConfig, AdjustmentSettings, ControlRules, PosePriors
 from roadscan.adjust.targets.shapes import SurveyedLine
-from roadscan.adjust.tasks.bundle import exposure_epochs, exposure_span
+from roadscan.adjust.tasks.cameras import exposure_epochs, exposure_span
 from roadscan.adjust.tasks.control_work import line_findings
 from roadscan.adjust.tasks.doubts import (
     CONTROL,
@@ -81,8 +81,7 @@ from roadscan.compute.array_types import Bool, Float64, Int32, Int64
 from roadscan.core.witness import Finding
 from roadscan.georeference.plan.plan import SurveyPlan, trajectory_source
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_recorded, stated_pose_sigma
-from roadscan.poses.movement import NO_SEAT, level_poses
-from roadscan.poses.trajectory import Corrections
+from roadscan.poses.trajectory import NO_SEAT, Corrections, level_poses
 
 _CHANGED: Final = 6
 """Changes of the σ of mountings, at most, until nothing contradicts them: a turn, axes in which control is doubted, and

@@ -13,8 +13,7 @@ import pyarrow as pa
 
 from roadscan.adjust.adjustment import CommonErrors
 from roadscan.adjust.observations import COMMON, KINDS, MOUNTED, Observations, mount_partials
-from roadscan.adjust.patches import PassReadings, Shift, shifted
-from roadscan.adjust.places import Place, Traverse
+from roadscan.adjust.places import PassReadings, Place, Shift, Traverse, shifted
 from roadscan.adjust.settings import TieSettings
 from roadscan.adjust.tasks.mountings import CHANCE, DETERMINED, Mounted
 from roadscan.adjust.tasks.near import Circle, NearFile, NearReader, Sources, changes_key, near_files, remounted_of
@@ -24,7 +23,7 @@ from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.sources import MapSettings, MountingChanges, road_key
-from roadscan.poses.movement import Seat
+from roadscan.poses.trajectory import Seat
 from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, recorded_table

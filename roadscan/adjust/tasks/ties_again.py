@@ -16,8 +16,7 @@ import numpy.typing as npt
 
 from roadscan.adjust.adjustment import MountingErrors
 from roadscan.adjust.observations import MOUNTED
-from roadscan.adjust.patches import Shift
-from roadscan.adjust.places import Place, Track, Traverse
+from roadscan.adjust.places import Place, Shift, Track, Traverse
 from roadscan.adjust.settings import AdjustConfig, TieSettings
 from roadscan.adjust.tasks.control_work import ControlTask, sighting_tasks
 from roadscan.adjust.tasks.near import Sources
@@ -32,8 +31,7 @@ from roadscan.core.gpstime import NS_PER_S
 from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.sources import MountingChanges, change_of
-from roadscan.poses.movement import MountingChange
-from roadscan.poses.trajectory import Corrections
+from roadscan.poses.trajectory import Corrections, MountingChange
 
 _STILL: Final[Shift] = (0.0, 0.0, 0.0)  # No shift (m).
 _UNCHANGED: Final = MountingChange.of(np.zeros(len(MOUNTED)))

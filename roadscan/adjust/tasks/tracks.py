@@ -30,7 +30,7 @@ from roadscan.core.witness import Finding, Witness
 from roadscan.georeference.plan.plan import SurveyPlan
 from roadscan.georeference.sources import Georeferencer, RawSlice, ReadingSource, geometry_of, read_rows
 from roadscan.navigation.tasks.trajectories import load_recorded
-from roadscan.poses.movement import LevelPoses, level_poses
+from roadscan.poses.trajectory import LevelPoses, level_poses
 from roadscan.run.keys import key_of
 from roadscan.store.logs import DataFile
 

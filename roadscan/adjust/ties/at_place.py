@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.observations import KINDS, Observations, partials
-from roadscan.adjust.patches import PassReadings, patch_of
-from roadscan.adjust.places import Place
+from roadscan.adjust.places import PassReadings, Place, patch_of
 from roadscan.adjust.settings import TieSettings
 from roadscan.adjust.ties.plane import height_tie, plane_ties
 from roadscan.adjust.ties.shift import KINDS_OF_PICTURES, Pictures, shift_ties

@@ -30,8 +30,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.kernels.patch_cells import add_moments, leave_out_far
-from roadscan.adjust.patches import PassReadings, Patch, level_from_map, map_from_axes
-from roadscan.adjust.places import Place, Track
+from roadscan.adjust.places import PassReadings, Patch, Place, Track, level_from_map, map_from_axes
 from roadscan.adjust.settings import TieSettings
 from roadscan.adjust.ties.tie import (
     COUNTS,

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.patches import PassReadings
+from roadscan.adjust.places import PassReadings
 from roadscan.adjust.settings import AgainSettings, TieSettings
 from roadscan.compute.array_types import Bool, Float64
 

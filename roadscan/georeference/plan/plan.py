@@ -41,8 +41,7 @@ from roadscan.ingest.sources import same_points
 from roadscan.navigation.tasks.clocks import load_clocks
 from roadscan.navigation.tasks.navigate import records_of, records_with_trajectories
 from roadscan.navigation.tasks.trajectories import TrajectorySource, load_all_corrections
-from roadscan.poses.movement import Allowance, allowance_for, largest
-from roadscan.poses.trajectory import STENCIL_KNOTS, Corrections
+from roadscan.poses.trajectory import STENCIL_KNOTS, Allowance, Corrections, allowance_for, largest
 from roadscan.run.keys import code_digest, grid_key, key_of
 from roadscan.run.session import Session, found_once
 from roadscan.store.logs import NAVIGATION, DataFile, Fault, LogRecord

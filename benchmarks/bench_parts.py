@@ -38,7 +38,7 @@ STAGES = ("ingest", "navigate", "footprints", "strips", "adjust", "tiles", "prod
 _PARTS = {
     "read and checked": ("roadscan.ingest.ingest:_items",),
     "written": ("roadscan.store.writer:LogWriter._write", "roadscan.store.writer:LogWriter.publish"),
-    "read and decoded": ("roadscan.store.readings.group_reader:GroupReader.read",),
+    "read and decoded": ("roadscan.store.readings.row_groups:GroupReader.read",),
     "placed and counted": (
         "roadscan.tiles.accumulator:Accumulator.run",
         "roadscan.tiles.accumulator:Accumulator.fill",

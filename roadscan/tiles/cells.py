@@ -28,7 +28,7 @@ from roadscan.core.grid import TileId
 from roadscan.core.survey import CellColumns
 from roadscan.store.digest import UNREADABLE
 from roadscan.store.manifest import OutputRecord, recorded_table
-from roadscan.store.readings.group_reader import opened
+from roadscan.store.readings.row_groups import opened
 from roadscan.store.schema import table_schema
 from roadscan.store.store import MADE_AGAIN, Store
 from roadscan.tiles.kernels.pyramid import Levels, Pixels, reduce_cells

@@ -13,8 +13,7 @@ import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
 from roadscan.core.errors import StoreError
-from roadscan.store.readings.group_reader import ReadAhead
-from roadscan.store.readings.row_groups import ProfileReader
+from roadscan.store.readings.row_groups import ProfileReader, ReadAhead
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store
 from roadscan.store.writer import write_parquet

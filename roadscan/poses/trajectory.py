@@ -440,11 +440,11 @@ class Travel:
         pose = self.trajectory.poses(np.array([epoch_gps_ns]), strict=True)
         if self.trajectory.world == LOCAL_WORLD:
             longitude = latitude = math.nan
-            world_from_ned = ENU_FROM_NED
+            from_ned = ENU_FROM_NED
         else:
             longitude, latitude = geodetic_from_world(self.trajectory.world, pose.position_world_m)[0, :2].tolist()
-            world_from_ned = ecef_from_ned(math.radians(latitude), math.radians(longitude))
-        _, _, heading = rph_from_rotation(world_from_ned.T @ pose.world_from_body[0])
+            from_ned = ecef_from_ned(math.radians(latitude), math.radians(longitude))
+        _, _, heading = rph_from_rotation(from_ned.T @ pose.world_from_body[0])
         return Fix(longitude, latitude, math.degrees(float(heading)) % 360.0)
 
 

@@ -18,9 +18,22 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from roadscan.store.codecs.parquet import pages
-from roadscan.store.codecs.parquet.page_file import MAGIC, SEAL, SEAL_DIGITS, with_digits
-from roadscan.store.codecs.parquet.pages import Value, binary, boolean, i8, i16, i32, i64, listed, struct
+from roadscan.store.codecs.parquet import page_file
+from roadscan.store.codecs.parquet.page_file import (
+    MAGIC,
+    SEAL,
+    SEAL_DIGITS,
+    Value,
+    binary,
+    boolean,
+    i8,
+    i16,
+    i32,
+    i64,
+    listed,
+    struct,
+    with_digits,
+)
 from roadscan.store.codecs.zlib_stream import LIBRARY, crc32
 
 _MOST_VALUES: Final = 1 << 28
@@ -135,22 +148,22 @@ class Writer:
     def _flat(self, field: pa.Field, column: pa.Array) -> Value:
         kind = KINDS[field.type]
         values = (column.drop_null() if column.null_count else column).to_numpy().astype(kind.stored)
-        levels = pages.flat_levels(_valid(field, column))
-        at, size = self.page(levels, values.view(np.uint8), len(column), pages.PLAIN)
+        levels = page_file.flat_levels(_valid(field, column))
+        at, size = self.page(levels, values.view(np.uint8), len(column), page_file.PLAIN)
         statistics = {3: i64(column.null_count)}
         if values.size:
             low, high = values.min().tobytes(), values.max().tobytes()
             statistics |= {5: binary(high), 6: binary(low)}
-        return chunk(kind, (field.name,), pages.PLAIN, len(column), Page(at, size), {12: struct(statistics)})
+        return chunk(kind, (field.name,), page_file.PLAIN, len(column), Page(at, size), {12: struct(statistics)})
 
     def _lists(self, field: pa.Field, column: pa.Array) -> Value:
         values = column.flatten().to_numpy()
-        levels = pages.list_levels(len(column), field.type.list_size, _valid(field, column))
+        levels = page_file.list_levels(len(column), field.type.list_size, _valid(field, column))
         packed = self.steps(values)
         count = values.size + column.null_count
-        at, size = self.page(levels, packed, count, pages.DELTA_BINARY_PACKED)
+        at, size = self.page(levels, packed, count, page_file.DELTA_BINARY_PACKED)
         path = (field.name, "list", "element")
-        return chunk(KINDS[field.type.value_type], path, pages.DELTA_BINARY_PACKED, count, Page(at, size), {})
+        return chunk(KINDS[field.type.value_type], path, page_file.DELTA_BINARY_PACKED, count, Page(at, size), {})
 
     def steps(self, values: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
         """Return the content of a page of differences of bytes or 16-bit numbers (n,), valid until the next one."""
@@ -176,24 +189,26 @@ class Writer:
     ) -> Value:
         """Write a column of non-null numbers as a page of a dictionary of `known` values and a page of indices."""
         start = self._at
-        head = pages.dictionary_header(dictionary.content.size, crc32(dictionary.content), known, dictionary.raw)
+        head = page_file.dictionary_header(dictionary.content.size, crc32(dictionary.content), known, dictionary.raw)
         self._at += self._stream.write(head) + self._stream.write(dictionary.content.data)
         first = self._at - start
-        at, size = self.page(b"", packed.content, count, pages.RLE_DICTIONARY, packed.raw)
+        at, size = self.page(b"", packed.content, count, page_file.RLE_DICTIONARY, packed.raw)
         raw = first - dictionary.content.size + dictionary.raw + size - packed.content.size + packed.raw
         kind, whole = KINDS[field.type], Page(at, first + size, raw, start)
-        return chunk(kind, (field.name,), pages.RLE_DICTIONARY, count, whole, more)
+        return chunk(kind, (field.name,), page_file.RLE_DICTIONARY, count, whole, more)
 
     def page(self, levels: bytes, values: Any, count: int, encoding: int, raw: int | None = None) -> tuple[int, int]:
         """Write a page, of `raw` bytes before compression; return where it starts, and its whole size."""
         start = self._at
         crc = crc32(values, crc32(levels))
-        self._at += self._stream.write(pages.page_header(len(levels) + values.size, crc, count, encoding, raw) + levels)
+        self._at += self._stream.write(
+            page_file.page_header(len(levels) + values.size, crc, count, encoding, raw) + levels
+        )
         self._at += self._stream.write(values)
         return start, self._at - start
 
 
-def _valid(field: pa.Field, column: pa.Array) -> pages.Bools | None:
+def _valid(field: pa.Field, column: pa.Array) -> page_file.Bools | None:
     """Return which values are present; None for a column that is never null."""
     if not field.nullable:
         return None
@@ -241,7 +256,9 @@ def _about(kind: Kind, path: tuple[str, ...], encoding: int, codec: int) -> dict
     """Return the common metadata of all chunks of a column."""
     return {
         1: i32(kind.physical),
-        2: listed([*([i32(pages.PLAIN)] * (encoding == pages.RLE_DICTIONARY)), i32(pages.RLE), i32(encoding)]),
+        2: listed(
+            [*([i32(page_file.PLAIN)] * (encoding == page_file.RLE_DICTIONARY)), i32(page_file.RLE), i32(encoding)]
+        ),
         3: listed([binary(name) for name in path]),
         4: i32(codec),
     }

@@ -17,9 +17,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.store.codecs.kernels.byte_planes import LONGEST_RUN_BYTES, encode_runs
-from roadscan.store.codecs.parquet import pages
+from roadscan.store.codecs.parquet import page_file
 from roadscan.store.codecs.parquet.list_table import KINDS, Packed, Page, Writer, chunk
-from roadscan.store.codecs.parquet.pages import Value, binary, i64, struct, varint, zigzag
+from roadscan.store.codecs.parquet.page_file import Value, binary, i64, struct, varint, zigzag
 from roadscan.store.codecs.zlib_stream import LIBRARY
 
 _SCRATCH: Final = 2048  # values of the scratch line that the kernels need
@@ -114,7 +114,7 @@ class _Numbers(Writer):
     def column(self, field: pa.Field, values: Array, step: float | None, stated: bool) -> Value:
         """Write a column chunk; return its part of the footer."""
         if values.dtype != np.int64:
-            encoding, packed = pages.BYTE_STREAM_SPLIT, self.pack(self._split(field, values, step))
+            encoding, packed = page_file.BYTE_STREAM_SPLIT, self.pack(self._split(field, values, step))
         elif self._epochs is not None and np.array_equal(values, self._epochs[0]):
             _, encoding, packed = self._epochs
         else:
@@ -132,12 +132,12 @@ class _Numbers(Writer):
 
     def lists(self, field: pa.Field, lists: Lists) -> Value:
         """Write a column chunk of non-null lists; return its part of the footer."""
-        levels, count = pages.varied_list_levels(lists.sizes)
+        levels, count = page_file.varied_list_levels(lists.sizes)
         packed = self.pack(np.concatenate([np.frombuffer(levels, np.uint8), self.steps(lists.values)]))
-        at, size = self.page(b"", packed.content, count, pages.DELTA_BINARY_PACKED, packed.raw)
+        at, size = self.page(b"", packed.content, count, page_file.DELTA_BINARY_PACKED, packed.raw)
         place = Page(at, size, size - packed.content.size + packed.raw)
         kind, path = KINDS[field.type.value_type], (field.name, "list", "element")
-        return chunk(kind, path, pages.DELTA_BINARY_PACKED, count, place, {})
+        return chunk(kind, path, page_file.DELTA_BINARY_PACKED, count, place, {})
 
     def _differences(self, values: Array) -> tuple[int, Bytes]:
         from roadscan.store.codecs.kernels.delta_packing import BLOCK, MINIBLOCKS, TOO_FAR, encode_long, room_words_long
@@ -146,10 +146,10 @@ class _Numbers(Writer):
             self._room = np.empty(room_words_long(values.size), np.uint64)
         packed = encode_long(np.ascontiguousarray(values), self._room)
         if packed == TOO_FAR:
-            return pages.PLAIN, values.astype("<i8").view(np.uint8)
+            return page_file.PLAIN, values.astype("<i8").view(np.uint8)
         head = varint(BLOCK) + varint(MINIBLOCKS) + varint(values.size) + zigzag(int(values[0]))
         content = np.concatenate([np.frombuffer(head, np.uint8), self._room.view(np.uint8)[:packed]])
-        return pages.DELTA_BINARY_PACKED, content
+        return page_file.DELTA_BINARY_PACKED, content
 
     def _split(self, field: pa.Field, values: Array, step: float | None) -> Bytes:
         from roadscan.store.codecs.kernels.byte_planes import split, split_rounded
@@ -178,7 +178,7 @@ def _as_runs(values: Array) -> tuple[Array, Bytes]:
 
 def _as_bytes(values: Array) -> tuple[Array, Bytes]:
     """Return all bytes up to the largest, and the page of indices of 8 bits, which are the values (n,) themselves."""
-    head = np.frombuffer(bytes([8]) + pages.bit_packed(values.size), np.uint8)
+    head = np.frombuffer(bytes([8]) + page_file.bit_packed(values.size), np.uint8)
     fill = np.zeros(-values.size % 8, np.uint8)
     return np.arange(int(values.max(initial=0)) + 1), np.concatenate([head, values, fill])
 

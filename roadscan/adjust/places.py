@@ -1,4 +1,4 @@
-"""Places where passes overlap, and the patch of road there as each pass saw it.
+"""Places where passes overlap, the patch of road there as each pass saw it, and the tie between two patches.
 
 Passes overlap as lanes side by side, a lane driven again, opposite directions, crossings and loops. Each track is
 sampled evenly along its path. Beside each lead sample, each `per_km`-th part of a kilometre, the part of
@@ -6,7 +6,8 @@ its cross-line that other tracks (or the same one, later) see is an interval, an
 intervals are taken. Where passes only abut, the place lies in the strip that both see. The first track in the given
 order leads; the others lead where it does not come.
 
-A patch has cells along and across, and the pose that saw them.
+A patch has cells along and across, and the pose that saw them. A tie is the difference of two traverses along one
+direction at one place, and why it does not count, if so.
 """
 
 from __future__ import annotations
@@ -21,8 +22,22 @@ from typing import Final, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.kernels.patch_cells import Cells, Frame, cell_numbers, fill_cells, local_axes
-from roadscan.adjust.kernels.visits import Bins, Limits, Meetings, Samples, Spread, Visits, feet, meetings, visits
+from roadscan.adjust.kernels.places import (
+    Bins,
+    Cells,
+    Frame,
+    Limits,
+    Meetings,
+    Samples,
+    Spread,
+    Visits,
+    cell_numbers,
+    feet,
+    fill_cells,
+    local_axes,
+    meetings,
+    visits,
+)
 from roadscan.adjust.settings import PlaceSettings
 from roadscan.compute.array_types import Bool, Float64, Int32, Int64, UInt16
 from roadscan.core.errors import NavigationError
@@ -451,3 +466,57 @@ def map_from_axes(place: Place, along_m: Float64, across_m: Float64, height_m: F
     easting = place.easting_m + along_m * sine + across_m * cosine
     northing = place.northing_m + along_m * cosine - across_m * sine
     return np.stack([easting, northing, height_m], axis=-1)
+
+
+HEIGHT: Final = "height_tie"
+SHIFT: Final = "shift_tie"
+PLANE: Final = "plane_tie"
+
+LASERS: Final = 256
+"""Lasers of a sensor are numbered by bytes."""
+
+COUNTS: Final = ""
+FEW_CELLS: Final = "too few cells in common"
+TOO_FAR: Final = "farther apart than the bound"
+TWO_SURFACES: Final = "too few cells agree"
+SCATTERED: Final = "cells scatter"
+STEEP: Final = "too steep"
+SAME_PASS: Final = "heads of one pass"
+
+
+@dataclass(frozen=True)
+class End:
+    """One end of a tie: a point of the road and the pose that saw it."""
+
+    readings: PassReadings
+    pose: int
+    """Row of the pose."""
+    point_m: Float64
+    """(3,) easting, northing, height as the recorded pose places it."""
+    laser: float = math.nan
+    """Laser that saw it; NaN of a sensor that has none."""
+
+
+@dataclass(frozen=True)
+class Tie:
+    """A measurement along one direction: the second end minus the first."""
+
+    kind: str
+    ends: tuple[End, End]
+    direction_level: Float64
+    """(3,) unit vector, north, east, down."""
+    value_m: float
+    sigma_m: float
+    count: int
+    """Number of cells or returns used."""
+    correlation: float
+    """Correlation of the two images; NaN where none was compared."""
+    why_not: str = COUNTS
+    """Empty if it counts."""
+    group: int = 0
+    """Ties of one group of a place stand or fall together."""
+
+    @property
+    def counts(self) -> bool:
+        """Returns whether the adjustment uses it."""
+        return self.why_not == COUNTS

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from roadscan.adjust.places import SHIFT
 from roadscan.adjust.settings import AgainSettings, TieSettings
-from roadscan.adjust.ties.tie import SHIFT, agreeing
+from roadscan.adjust.tasks.ties_again import agreeing
 
 AHEAD = np.array([0.87, -0.49]) / np.hypot(0.87, 0.49)
 """North and east of the road's direction."""

@@ -11,12 +11,11 @@ import pytest
 
 from roadscan.adjust.adjustment import CommonErrors, adjust
 from roadscan.adjust.observations import COMMON, KINDS, GaussMarkov, Observations, RunPrior
-from roadscan.adjust.places import Track
+from roadscan.adjust.places import LASERS, PLANE, Track
 from roadscan.adjust.settings import AdjustmentSettings
 from roadscan.adjust.tasks.mountings import Mounted
 from roadscan.adjust.tasks.tie_work import lidar_error_findings, lidar_error_lines
 from roadscan.adjust.ties.plane import lean_findings, leans
-from roadscan.adjust.ties.tie import LASERS, PLANE
 
 MOUNTED = Mounted((), {("drive", "lidar"): None}, frozenset(), common_sigma=(0.01, math.radians(0.1)))  # type: ignore[dict-item]
 OFFS_M = np.random.default_rng(3).normal(0.0, 0.01, 16)  # of the lasers, as their σ says

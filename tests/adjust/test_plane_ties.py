@@ -11,7 +11,7 @@ from roadscan.adjust.adjustment import adjust
 from roadscan.adjust.observations import COMMON, KINDS, GaussMarkov, Observations, RunPrior
 from roadscan.adjust.places import PassReadings, Place, Traverse
 from roadscan.adjust.settings import AdjustmentSettings, TieSettings
-from roadscan.adjust.ties.at_place import Ties, ties_at
+from roadscan.adjust.tasks.tie_work import Ties, ties_at
 
 PLACE = Place(0, 1000.0, 2000.0, 0.0, 8.0, (Traverse(0, "lidar", 0, 10**10),))
 NOISE_M = 0.01

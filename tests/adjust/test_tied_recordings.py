@@ -15,7 +15,7 @@ from roadscan.adjust.adjustment import Adjustment, adjust
 from roadscan.adjust.observations import KINDS, GaussMarkov, Observations, RunPrior
 from roadscan.adjust.places import PassReadings, Place, Track, places_of_overlap
 from roadscan.adjust.settings import AdjustmentSettings, PlaceSettings, TieSettings
-from roadscan.adjust.ties.at_place import Ties, ties_at
+from roadscan.adjust.tasks.tie_work import Ties, ties_at
 
 GPS_MINUS_UNIX_NS = (18 - 315_964_800) * 10**9
 

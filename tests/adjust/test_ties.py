@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from roadscan.adjust.places import PassReadings
 from roadscan.adjust.settings import TieSettings
-from roadscan.adjust.ties.at_place import Ties, pairs_of, ties_at
+from roadscan.adjust.tasks.tie_work import Ties, pairs_of, ties_at
 from tests.adjust.drawn_patches import PLACE, Road, Seen, bars, crack, dash_end, edge_line, flat, joints, kerb, readings
 
 SETTINGS = TieSettings()

@@ -8,21 +8,29 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from roadscan.adjust.kernels.patch_cells import (
+from roadscan.adjust.kernels.places import (
+    Bins,
     Cells,
     Frame,
     Laid,
+    Limits,
+    Meetings,
+    Samples,
     Splat,
+    Spread,
+    Visits,
     add_moments,
     cell_numbers,
     correlate,
+    feet,
     fill_cells,
     lay_upon,
     leave_out_far,
     local_axes,
+    meetings,
     splat,
+    visits,
 )
-from roadscan.adjust.kernels.visits import Bins, Limits, Meetings, Samples, Spread, Visits, feet, meetings, visits
 
 
 def two_tracks() -> Samples:

@@ -15,14 +15,29 @@ import pyarrow as pa
 
 from roadscan.adjust.bundle.outcome import CameraResiduals, draw_residuals
 from roadscan.adjust.observations import KINDS
-from roadscan.adjust.places import PassReadings, Patch, Place, Traverse, map_from_level, patch_of
+from roadscan.adjust.places import (
+    FEW_CELLS,
+    HEIGHT,
+    PLANE,
+    SAME_PASS,
+    SCATTERED,
+    SHIFT,
+    STEEP,
+    TOO_FAR,
+    TWO_SURFACES,
+    PassReadings,
+    Patch,
+    Place,
+    Traverse,
+    map_from_level,
+    patch_of,
+)
 from roadscan.adjust.quality import AdjustmentPicture, ShownSeam, draw_adjustment, draw_seams
 from roadscan.adjust.settings import TieSettings
 from roadscan.adjust.tasks.near import Circle, NearReader
 from roadscan.adjust.tasks.publication import Held, Rows
 from roadscan.adjust.tasks.solution import Evidence, Solution
 from roadscan.adjust.tasks.tie_work import DIAGONAL, KnownTies, TieTask
-from roadscan.adjust.ties.tie import FEW_CELLS, HEIGHT, PLANE, SAME_PASS, SCATTERED, SHIFT, STEEP, TOO_FAR, TWO_SURFACES
 from roadscan.compute.array_types import Float64
 from roadscan.core.extras import can_draw
 from roadscan.core.witness import Finding, Witness

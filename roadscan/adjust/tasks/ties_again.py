@@ -2,29 +2,29 @@
 
 Poses of two passes may lie decimetres apart. Then the compared patches are not one place of the road: shifts are not
 found, and heights are those of neighbouring spots. So places are measured again where the solution puts them until no
-place moves by more than a share of its patch. Where too few match to begin with, larger patches are sought first.
+place moves by more than a share of its patch. Where too few match to begin with, larger patches are sought first. A
+single larger patch may match at a wrong place: what counts is the shift that most patches of two passes agree on.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.adjustment import MountingErrors
 from roadscan.adjust.observations import MOUNTED
-from roadscan.adjust.places import Place, Shift, Track, Traverse
-from roadscan.adjust.settings import AdjustConfig, TieSettings
+from roadscan.adjust.places import HEIGHT, SHIFT, Place, Shift, Track, Traverse
+from roadscan.adjust.settings import AdjustConfig, AgainSettings, TieSettings
 from roadscan.adjust.tasks.control_work import ControlTask, sighting_tasks
 from roadscan.adjust.tasks.near import Sources
 from roadscan.adjust.tasks.solution import Solution, priors_of
 from roadscan.adjust.tasks.tie_work import KnownTies, TieTask, tie_tasks
 from roadscan.adjust.tasks.tracks import runs_of
 from roadscan.adjust.ties.plane import Lean, leans
-from roadscan.adjust.ties.tie import agreeing, is_matched, misplaced, places_of_pairs
 from roadscan.compute.array_types import Bool, Float64
 from roadscan.core.counted import counted
 from roadscan.core.gpstime import NS_PER_S
@@ -142,12 +142,10 @@ def first_ties(
     observe(larger)
     far = load(larger)
     kept, apart = _agreed(far, ties, AdjustConfig.of(plan.survey), _sigmas(plan, sources))
-    misplaced, findings = _contradicted(plan, sources, ties, apart)
+    wrong_m, findings = _contradicted(plan, sources, ties, apart)
     # Matches of passes that lie apart are not of one place of the road.
     joined = ties.refused(_of_pairs(ties, apart)).with_more(far, kept)
-    return Again(
-        tuple(tasks), joined, tuple(larger), tuple(control), far, misplaced=misplaced, findings=tuple(findings)
-    )
+    return Again(tuple(tasks), joined, tuple(larger), tuple(control), far, misplaced=wrong_m, findings=tuple(findings))
 
 
 def settled(
@@ -382,3 +380,154 @@ def _shift(corrections: Corrections | None, traverse: Traverse) -> Shift:
 def _extent(moved: npt.NDArray[np.float64]) -> float:
     """Returns the largest distance between two of some points (n, 2)."""
     return float(np.hypot(*(moved[:, None] - moved[None]).T).max())
+
+
+Column = Mapping[str, npt.NDArray[Any]]
+
+_LEAST: Final = 3
+"""Least number of patches that must agree: two agree by chance."""
+_MOST: Final = 0.5
+"""Share of the heights of two passes, and of the patches, that is most of them."""
+_SIGMAS: Final = 3.0  # Differences within this many σ agree.
+_ALIKE_M: Final = 0.02
+"""Greatest difference of ties that agree, besides their σ (m): poses drift by this much, and chance matches by more."""
+_ALONG: Final = 0.5
+"""Cosine from which a direction shows a shift."""
+
+
+def places_of_pairs(tried: Column) -> dict[tuple[str, str], list[int]]:
+    """Returns places that two runs share, or two drives of one run, by the names of both."""
+    heights = (tried["kind"] == HEIGHT) & ~_of_one_pass(tried)
+    pairs = sorted(set(zip(tried["first_run"][heights].tolist(), tried["second_run"][heights].tolist(), strict=True)))
+    return {
+        (a, b): np.unique(tried["place"][heights & (tried["first_run"] == a) & (tried["second_run"] == b)]).tolist()
+        for a, b in pairs
+    }
+
+
+def is_matched(tried: Column, pair: tuple[str, str]) -> bool:
+    """Returns whether the heights of most places that two runs share could be compared."""
+    own = (tried["first_run"] == pair[0]) & (tried["second_run"] == pair[1]) & ~_of_one_pass(tried)
+    heights = tried["accepted"][own & (tried["kind"] == HEIGHT)]
+    return bool(heights.size and (heights == 1).mean() >= _MOST)
+
+
+def _of_one_pass(tried: Column) -> Bool:
+    """Returns a mask of comparisons of heads that passed together."""
+    same = tried["first_run"] == tried["second_run"]
+    apart = np.abs(tried["first_epoch_gps_ns"] - tried["second_epoch_gps_ns"])
+    return np.asarray(same & (apart < 30_000_000_000))
+
+
+def agreeing(
+    tried: Column, near: Column, settings: AgainSettings, fine: TieSettings, most_up_m: float
+) -> tuple[Bool, Float64]:
+    """Returns a mask (n,) of the larger patches that agree on a shift which ties did not find, and that shift (3,).
+
+    The shift is the second run's place minus the first one's: north, east, down (m).
+
+    Parameters
+    ----------
+    near : ties of the same runs. Where passes lie apart, these match at odd places; if they agree on another shift,
+        the larger patches are wrong, because of marks that repeat.
+    most_up_m : passes that lie farther above one another than this contradict the σ of their poses.
+    """
+    counts = tried["accepted"] == 1
+    shift = np.zeros(3)
+    kept = _agreeing_shifts(tried, counts & (tried["kind"] == SHIFT), settings.alike_m)
+    if kept.any():
+        shift[:2] = _solved(tried, np.flatnonzero(kept))
+        # Relief that contradicts paint counts as well: one of the two matched at a wrong place.
+        every = (tried["kind"] == SHIFT) & np.isfinite(tried["value_m"])
+        if not _is_supported(tried, kept, every, shift[:2]) or _is_contradicted(near, shift[:2], settings.alike_m):
+            kept[:], shift[:2] = False, 0.0
+    heights = np.flatnonzero(counts & (tried["kind"] == HEIGHT))
+    level = float(np.median(tried["value_m"][heights])) if heights.size >= _LEAST else 0.0
+    alike = np.zeros(counts.size, np.bool_)
+    alike[heights] = np.abs(tried["value_m"][heights] - level) <= settings.alike_m
+    if alike.sum() > _MOST * heights.size:
+        shift[2] = -level
+    is_far = np.hypot(*shift[:2]) > fine.search_m or abs(shift[2]) > max(most_up_m, settings.alike_m)
+    return ((kept | alike), shift) if is_far else (np.zeros(counts.size, np.bool_), np.zeros(3))
+
+
+def misplaced(runs: Sequence[str], close: Iterable[tuple[str, str]], far: Mapping[tuple[str, str], Float64],
+              held: Sequence[str]) -> dict[str, Float64]:  # fmt: skip
+    """Returns how far (3,) runs lie from those with which most agree, by name; all of them where none are most.
+
+    Parameters
+    ----------
+    close : pairs of runs that match. far : shifts of pairs that do not.
+    held : runs that are right in any case.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    number = {run: k for k, run in enumerate(runs)}
+    pairs = np.array([(number[a], number[b]) for a, b in close], np.int64).reshape(-1, 2)
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(runs), len(runs)))
+    group = connected_components(graph, directed=False)[1]
+    in_far = sorted({run for pair in far for run in pair})
+    sizes = {g: int((group == g).sum()) for g in {int(group[number[run]]) for run in in_far}}
+    right = {int(group[number[run]]) for run in held}
+    if not right & sizes.keys():
+        most = max(sizes.values(), default=0)
+        right = {g for g, size in sizes.items() if size == most}
+        right = right if len(right) == 1 else set()
+    found: dict[str, Float64] = {}
+    for pair, shift in far.items():
+        for run in pair:
+            if int(group[number[run]]) not in right and run not in held:
+                found[run] = np.maximum(found.get(run, np.zeros(3)), np.abs(shift))
+    return found
+
+
+def _is_supported(tried: Column, kept: Bool, every: Bool, shift: Float64) -> bool:
+    """Returns whether enough places show the shift along itself: most of a road shows only the shift across."""
+    length = float(np.hypot(*shift))
+    along = np.abs(_directions(tried, np.arange(kept.size)) @ shift) > _ALONG * length
+    support, against = (np.unique(tried["place"][own & along]) for own in (kept, every & ~kept))
+    return support.size >= _LEAST and support.size > np.setdiff1d(against, support).size
+
+
+def _is_contradicted(near: Column, shift: Float64, alike_m: float) -> bool:
+    """Returns whether ties agree on another shift along the same direction."""
+    rows = np.flatnonzero((near["accepted"] == 1) & (near["kind"] == SHIFT))
+    directions = _directions(near, rows)
+    along = directions @ shift / max(float(np.hypot(*shift)), 1e-9)
+    rows, along = rows[np.abs(along) > _ALONG], along[np.abs(along) > _ALONG]
+    if np.unique(near["place"][rows]).size < _LEAST:
+        return False
+    values = near["value_m"][rows] * np.sign(along)
+    level = float(np.median(values))
+    agree = np.abs(values - level) <= _ALIKE_M + _SIGMAS * near["sigma_m"][rows]
+    elsewhere = np.abs(values - np.abs(along) * float(np.hypot(*shift))) > alike_m
+    return bool((agree & elsewhere).sum() > _MOST * rows.size)
+
+
+def _agreeing_shifts(tried: Column, own: Bool, alike_m: float) -> Bool:
+    """Returns rows of the places that agree on one shift, none where those are few, or fewer than half of all."""
+    places = tried["place"]
+    numbers, best = np.unique(places[own]), np.zeros(own.size, np.bool_)
+    for number in numbers:
+        rows = np.flatnonzero(own & (places == number))
+        if np.linalg.matrix_rank(_directions(tried, rows), tol=0.5) < 2:
+            continue
+        shift = _solved(tried, rows)
+        away = np.abs(tried["value_m"] - _directions(tried, np.arange(own.size)) @ shift)
+        fits = own & (away <= alike_m + _SIGMAS * np.where(own, tried["sigma_m"], 0.0))
+        if np.unique(places[fits]).size > np.unique(places[best]).size:
+            best = fits
+    count = np.unique(places[best]).size
+    return best if count >= _LEAST and count > _MOST * numbers.size else np.zeros(own.size, np.bool_)
+
+
+def _directions(tried: Column, rows: npt.NDArray[np.int64]) -> Float64:
+    return np.stack([tried["direction_north"][rows], tried["direction_east"][rows]], axis=-1)
+
+
+def _solved(tried: Column, rows: npt.NDArray[np.int64]) -> Float64:
+    """Returns the shift (2,) north, east of rows that all agree."""
+    sigma = tried["sigma_m"][rows]
+    design = _directions(tried, rows) / sigma[:, None]
+    return np.asarray(np.linalg.lstsq(design, tried["value_m"][rows] / sigma, rcond=None)[0])

@@ -17,12 +17,10 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.adjust.observations import KINDS
-from roadscan.adjust.places import Place, Track, places_of_overlap
+from roadscan.adjust.places import HEIGHT, Place, Track, places_of_overlap
 from roadscan.adjust.settings import AdjustConfig, PlaceSettings
 from roadscan.adjust.tasks.near import NearReader, PlacedReadings, Sources, near_files, placed_readings
-from roadscan.adjust.tasks.tie_work import KnownTies, ties_of
-from roadscan.adjust.ties.at_place import Ties
-from roadscan.adjust.ties.tie import HEIGHT
+from roadscan.adjust.tasks.tie_work import KnownTies, Ties, ties_of
 from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.arrays import scatter_about
 from roadscan.core.gpstime import NS_PER_S

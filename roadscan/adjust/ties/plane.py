@@ -29,10 +29,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from roadscan.adjust.kernels.patch_cells import add_moments, leave_out_far
-from roadscan.adjust.places import PassReadings, Patch, Place, Track, level_from_map, map_from_axes
-from roadscan.adjust.settings import TieSettings
-from roadscan.adjust.ties.tie import (
+from roadscan.adjust.kernels.places import add_moments, leave_out_far
+from roadscan.adjust.places import (
     COUNTS,
     FEW_CELLS,
     HEIGHT,
@@ -43,8 +41,15 @@ from roadscan.adjust.ties.tie import (
     TOO_FAR,
     TWO_SURFACES,
     End,
+    PassReadings,
+    Patch,
+    Place,
     Tie,
+    Track,
+    level_from_map,
+    map_from_axes,
 )
+from roadscan.adjust.settings import TieSettings
 from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.compute.arrays import scatter_about
 from roadscan.core.gpstime import NS_PER_S

@@ -18,10 +18,9 @@ from typing import Final
 
 import numpy as np
 
-from roadscan.adjust.kernels.patch_cells import Laid, Splat, correlate, lay_upon, splat
-from roadscan.adjust.places import Patch, level_from_map, map_from_axes
+from roadscan.adjust.kernels.places import Laid, Splat, correlate, lay_upon, splat
+from roadscan.adjust.places import SHIFT, End, Patch, Tie, level_from_map, map_from_axes
 from roadscan.adjust.settings import TieSettings
-from roadscan.adjust.ties.tie import SHIFT, End, Tie
 from roadscan.compute.array_types import Float64, Int64
 
 BLUR_CELLS: Final = 1.2

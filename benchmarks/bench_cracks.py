@@ -19,10 +19,10 @@ import shapely
 
 from benchmarks.timing import Figure, thread_seconds
 from roadscan.distress.crack_network import Crack, join_cracks
+from roadscan.distress.crack_response import LINE_HALF, flank_cells
 from roadscan.distress.cracks import crack_pieces
 from roadscan.distress.potholes import join_potholes, pothole_pieces
 from roadscan.distress.settings import CrackDetection, CrackJoining, PotholeDetection, PotholeJoining
-from roadscan.distress.valley_lines import LINE_HALF, flank_cells
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
 from roadscan.surface.heights import HeightWindow, LowestReadings

@@ -20,9 +20,8 @@ from roadscan.core.grid import Bounds
 from roadscan.surface.clough_tocher import cubic_surface
 from roadscan.surface.normals import slopes_at
 from roadscan.surface.reconstruction import DetailedSettings
-from roadscan.surface.sites import sites
 from roadscan.surface.tile import GridWindow
-from roadscan.surface.triangulation import triangulate
+from roadscan.surface.triangulation import sites, triangulate
 from tests.surface.detailed_surface import detailed_surface
 from tests.surface.test_detailed import franke
 

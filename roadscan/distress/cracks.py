@@ -1,11 +1,11 @@
 """Cracks in a window of the surface, as pieces of line that are joined over tiles (``crack_network.py``).
 
-The skeleton comes from ``valleys.py``. At each of its cells a cross-section is measured on heights *before*
+The skeleton comes from ``crack_response.py``. At each of its cells a cross-section is measured on heights *before*
 smoothing (impulses left out): all cells up to 4.5 cells along the crack are sorted by their distance from its line into
 bins of half a cell. Because a line rarely runs along the grid, the section is finer than a cell; nothing is
 interpolated between cells and nothing is smoothed across the crack. Ground is the straight line between the flanks.
 Where that shows no crack, or one less than half as deep, the section is that of heights lowered to the lowest readings,
-as ``valleys.py`` asks them.
+as ``crack_response.py`` asks them.
 
 - *depth*: of the bottom below the ground: from robust heights, where cells lie in the crack alone, and from the lowest
   readings of cells, where it is narrower (``crack_depths.py``). Where these are not known, robust heights show
@@ -54,13 +54,11 @@ import numpy.typing as npt
 
 from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.arrays import way_along
-from roadscan.distress import valleys
-from roadscan.distress.kernels.cross_sections import cross_sections
-from roadscan.distress.kernels.quantiles_along import HALF_ALONG, quantiles_along
+from roadscan.distress import crack_response
+from roadscan.distress.crack_response import DIRECTIONS, CrackResponse, bridge_cells, crack_response_of, flank_cells
+from roadscan.distress.kernels.cross_sections import CELLS_ALONG, cross_sections, quantiles_along
 from roadscan.distress.settings import CrackDetection
 from roadscan.distress.skeleton_graph import PRUNINGS, SkeletonGraph, pruned, trimmed
-from roadscan.distress.valley_lines import DIRECTIONS, flank_cells
-from roadscan.distress.valleys import Valleys, bridge_cells, find_valleys
 from roadscan.surface.heights import HeightWindow, LowestReadings
 
 NARROW_CELLS: Final = 2.5  # Width (cells) up to which the depth comes from lowest readings alone.
@@ -219,7 +217,7 @@ def halo_cells(config: CrackDetection, cell_m: float) -> int:
     """Returns the margin that a window needs around the cells in which cracks are wanted (cells)."""
     reach = math.ceil(math.hypot(4.5, section_cells(config, cell_m))) + 1
     walked = bridge_cells() + 2 + PRUNINGS * (_spur_cells(config, cell_m) + 2) + _SMOOTHINGS + 2
-    return valleys.halo_cells(config, cell_m) + max(HALF_ALONG + reach, walked)
+    return crack_response.halo_cells(config, cell_m) + max(CELLS_ALONG + reach, walked)
 
 
 def crack_pieces(window: HeightWindow, config: CrackDetection) -> list[CrackPiece]:
@@ -231,7 +229,7 @@ def crack_pieces(window: HeightWindow, config: CrackDetection) -> list[CrackPiec
     window = needed_part(window, config)
     if not window.raw_m.size:
         return []
-    found = find_valleys(window, config)
+    found = crack_response_of(window, config)
     graph = pruned(trimmed(found.skeleton, found.bridge, bridge_cells()), _spur_cells(config, window.cell_m))
     if not graph.edges.size:
         return []
@@ -247,7 +245,7 @@ def needed_part(window: HeightWindow, config: CrackDetection) -> HeightWindow:
     own = window.inner()
     part = window.part(*((max(s.start - halo, 0), s.stop + halo) for s in own))
     known = ~np.isnan(part.raw_m)
-    border = valleys.border_cells(config, window.cell_m)
+    border = crack_response.border_cells(config, window.cell_m)
     spans = [np.flatnonzero(known.any(axis=axis)) for axis in (1, 0)]
     return part.part(*((int(at[0]) - border, int(at[-1]) + 1 + border) if at.size else (0, 0) for at in spans))
 
@@ -273,7 +271,7 @@ def _spur_cells(config: CrackDetection, cell_m: float) -> int:
     return round(config.spur_m / cell_m)
 
 
-def _sections(window: HeightWindow, found: Valleys, graph: SkeletonGraph, config: CrackDetection) -> Sections:
+def _sections(window: HeightWindow, found: CrackResponse, graph: SkeletonGraph, config: CrackDetection) -> Sections:
     cells = _valley_cells(found)
     row, column = cells.row, cells.column
     out = _valley_sections(window.cleaned_m(), cells, window, config)
@@ -307,7 +305,7 @@ def _valley_sections(heights: Float64, cells: ValleyCells, window: HeightWindow,
     return out
 
 
-def _valley_cells(found: Valleys) -> ValleyCells:
+def _valley_cells(found: CrackResponse) -> ValleyCells:
     """Returns all cells of the skeleton, also those pruned later: what is pruned depends on cells far away."""
     row, column = np.nonzero(found.skeleton)
     angle = found.direction[row, column] * (np.pi / DIRECTIONS)

@@ -8,7 +8,7 @@ from roadscan.core.strict import Strict
 
 
 class CrackDetection(Strict):
-    """Where a surface has cracks (``valleys.py``, ``cracks.py``)."""
+    """Where a surface has cracks (``crack_response.py``, ``cracks.py``)."""
 
     max_width_m: float = Field(default=0.04, gt=0.0, le=0.2)
     """Widest crack that is looked for (m): a valley whose flanks are farther apart is none."""

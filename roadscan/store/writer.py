@@ -343,8 +343,12 @@ def write_parquet(path: Path, rows: pa.Table, schema: TableSchema) -> None:
     if schema.name == PACKED:
         write_packed_returns(path, rows, schema.row_group_rows)
         return
-    from roadscan.store.codecs.parquet.list_table import is_list_table, write_list_table
-    from roadscan.store.codecs.parquet.number_table import is_number_table, write_number_table
+    from roadscan.store.codecs.parquet.tables import (
+        is_list_table,
+        is_number_table,
+        write_list_table,
+        write_number_table,
+    )
 
     if is_list_table(rows.schema):
         write_list_table(path, rows, schema.row_group_rows)

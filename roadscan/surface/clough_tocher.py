@@ -41,9 +41,8 @@ import numpy.typing as npt
 
 from roadscan.compute.kernels.patch_heights import POINTS
 from roadscan.surface.kernels.clough_tocher import control_points, cross_slopes, evaluate
-from roadscan.surface.sites import Sites, from_steps, steps
 from roadscan.surface.tile import GridWindow
-from roadscan.surface.triangulation import Triangulation
+from roadscan.surface.triangulation import Sites, Triangulation, from_steps, steps
 
 NOWHERE: Final = np.nan
 

@@ -46,8 +46,7 @@ import numpy.typing as npt
 from roadscan.surface.kernels.delaunay import MOST, MOST_RINGS, neighbourhoods
 from roadscan.surface.kernels.spline_gradients import FITTED, LEVEL, WORK, spline_gradients, vertex_gradients
 from roadscan.surface.settings import SlopeKind
-from roadscan.surface.sites import Sites
-from roadscan.surface.triangulation import Triangulation
+from roadscan.surface.triangulation import Sites, Triangulation
 
 RINGS: Final = MOST_RINGS
 """Greatest distance of a neighbour on which a slope depends, in edges."""

@@ -39,10 +39,9 @@ from roadscan.georeference.cloud import TilePoints
 from roadscan.surface.heights import LowestReadings
 from roadscan.surface.regions import FILLED, INTERPOLATED, MEASURED
 from roadscan.surface.settings import SlopeKind, SurfaceConfig, SurfaceSmoothing
-from roadscan.surface.sites import sites
 from roadscan.surface.smoothing import halo_cells, smooth_surface
 from roadscan.surface.tile import EMPTY, GridWindow, SurfaceTile
-from roadscan.surface.triangulation import triangulate
+from roadscan.surface.triangulation import sites, triangulate
 from roadscan.tiles.cells import TileCells
 
 if TYPE_CHECKING:

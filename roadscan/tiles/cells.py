@@ -34,7 +34,7 @@ from roadscan.store.store import MADE_AGAIN, Store
 from roadscan.tiles.kernels.pyramid import Levels, Pixels, reduce_cells
 
 if TYPE_CHECKING:
-    from roadscan.store.codecs.parquet.number_table import Lists
+    from roadscan.store.codecs.parquet.tables import Lists
 
 
 @dataclass(frozen=True)
@@ -214,7 +214,7 @@ _GROUP_ROWS: Final = 1 << 20  # Rows in a row group.
 
 def write_cells(path: Path, cells: TileCells, columns: CellColumns = "full") -> None:
     """Write a tile's cells; same cells, same bytes."""
-    from roadscan.store.codecs.parquet.number_table import write_number_groups
+    from roadscan.store.codecs.parquet.tables import write_number_groups
 
     schema, n = _stored("cells", columns), len(cells)
     groups = (_rows_of(cells, schema, k, min(k + _GROUP_ROWS, n)) for k in range(0, n, _GROUP_ROWS))
@@ -223,7 +223,7 @@ def write_cells(path: Path, cells: TileCells, columns: CellColumns = "full") -> 
 
 def _rows_of(cells: TileCells, schema: pa.Schema, first: int, end: int) -> dict[str, npt.NDArray[Any] | Lists]:
     """Return the columns of the cells `first` to `end` − 1."""
-    from roadscan.store.codecs.parquet.number_table import Lists
+    from roadscan.store.codecs.parquet.tables import Lists
 
     found: dict[str, npt.NDArray[Any] | Lists] = {}
     for field in schema:
@@ -237,7 +237,7 @@ def _rows_of(cells: TileCells, schema: pa.Schema, first: int, end: int) -> dict[
 
 def write_overviews(path: Path, levels: Sequence[Level]) -> None:
     """Write a tile's overviews with a row group per level, so that one can be read without the others."""
-    from roadscan.store.codecs.parquet.number_table import write_number_groups
+    from roadscan.store.codecs.parquet.tables import write_number_groups
 
     schema = _stored("overviews", "full")
     groups = (

@@ -12,10 +12,10 @@ import shapely
 from numpy.lib.stride_tricks import sliding_window_view
 
 from roadscan.distress.crack_network import join_cracks
+from roadscan.distress.crack_response import LINE_HALF, flank_cells
 from roadscan.distress.cracks import NARROW_CELLS, WIDE_CELLS, blended, crack_pieces
-from roadscan.distress.kernels.quantiles_along import quantiles_along
+from roadscan.distress.kernels.cross_sections import quantiles_along
 from roadscan.distress.settings import CrackDetection, CrackJoining
-from roadscan.distress.valley_lines import LINE_HALF, flank_cells
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
 from roadscan.surface.heights import HeightWindow, LowestReadings

@@ -13,13 +13,12 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from roadscan.core.errors import ConfigError, RoadscanError
-from roadscan.distress.crack_network import join_cracks
-from roadscan.distress.crack_parts import bridges
+from roadscan.distress.crack_network import bridges, join_cracks
+from roadscan.distress.crack_response import _boxes, _thinned, crack_response_of
 from roadscan.distress.cracks import CrackPiece, crack_pieces, halo_cells, needed_part, sharpened
 from roadscan.distress.kernels.cross_sections import cross_sections
 from roadscan.distress.settings import CrackDetection, CrackJoining
 from roadscan.distress.skeleton_graph import SkeletonGraph, pruned
-from roadscan.distress.valleys import _boxes, _thinned, find_valleys
 from roadscan.simulate.scene import Scene
 from roadscan.simulate.surface import Surface
 from roadscan.surface.heights import HeightWindow, LowestReadings
@@ -190,7 +189,7 @@ def test_tiles_give_the_bits_and_the_cracks_of_the_whole():
     halo = halo_cells(config, 0.005)
     whole = with_lowest(net(halo, half=1.2))
     expected = crack_pieces(whole, config)
-    assert find_valleys(whole, config).bridge.sum() > 100
+    assert crack_response_of(whole, config).bridge.sum() > 100
     found = []
     for rows in (slice(0, 2 * halo + 61), slice(61, None)):
         for columns in (slice(0, 2 * halo + 50), slice(50, None)):
@@ -220,7 +219,7 @@ def test_what_is_empty_is_not_looked_at_and_changes_nothing():
     assert part.raw_m.shape < (260, 320)
     low = part.first_row - whole.first_row, part.first_column - whole.first_column
     own = tuple(slice(a, a + n) for a, n in zip(low, part.raw_m.shape, strict=True))
-    expected, found = find_valleys(whole, config), find_valleys(part, config)
+    expected, found = crack_response_of(whole, config), crack_response_of(part, config)
     assert found.skeleton.sum() > 300 and expected.skeleton.sum() == found.skeleton.sum()
     assert (expected.skeleton[own] == found.skeleton).all()
     for name in ("depth_m", "direction", "flank"):

@@ -14,7 +14,7 @@ import pytest
 
 from roadscan.core.errors import DamagedError, StoreError, may_pass
 from roadscan.footprints.reach import opened
-from roadscan.store.codecs.parquet.list_table import write_list_table
+from roadscan.store.codecs.parquet.tables import write_list_table
 from roadscan.store.digest import sealed_parquet
 from roadscan.store.readings.row_groups import read_groups
 from roadscan.store.store import Store

@@ -8,9 +8,8 @@ import numpy.typing as npt
 from roadscan.surface.clough_tocher import CubicSurface, cubic_surface
 from roadscan.surface.normals import slopes_at
 from roadscan.surface.reconstruction import DetailedSettings
-from roadscan.surface.sites import sites
 from roadscan.surface.tile import GridWindow
-from roadscan.surface.triangulation import triangulate
+from roadscan.surface.triangulation import sites, triangulate
 
 
 def surface_through(points_m: npt.NDArray[np.float64], settings: DetailedSettings) -> CubicSurface:

@@ -12,9 +12,8 @@ from roadscan.core.grid import Bounds
 from roadscan.surface.clough_tocher import CubicSurface, cubic_surface
 from roadscan.surface.normals import slopes_at
 from roadscan.surface.reconstruction import DetailedSettings
-from roadscan.surface.sites import sites
 from roadscan.surface.tile import GridWindow
-from roadscan.surface.triangulation import triangulate
+from roadscan.surface.triangulation import sites, triangulate
 from tests.surface.detailed_surface import detailed_surface, surface_through
 
 UNIT = GridWindow(0, 0, 80, 60, 1.0 / 80, 1.0 / 60)

@@ -14,7 +14,7 @@ from roadscan.core.errors import StoreError
 from roadscan.core.grid import TileGrid, TileId
 from roadscan.georeference.cloud import TilePoints
 from roadscan.ingest.inspect.inspect import inspect
-from roadscan.store.codecs.parquet.number_table import Lists, write_number_groups
+from roadscan.store.codecs.parquet.tables import Lists, write_number_groups
 from roadscan.store.manifest import OutputRecord
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store

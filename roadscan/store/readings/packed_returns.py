@@ -162,7 +162,7 @@ def write_packed_returns(path: Path, rows: pa.Table, group_rows: int) -> None:
         boxes.append([[float(values.min()), float(values.max())] for values in own])
     about = {BEAMS: beams.encoded(), _BOXES: json.dumps(boxes, separators=(",", ":")).encode()}
     runs = [c.name for c in table_schema(PACKED).columns if c.encoding == "RLE_DICTIONARY"]
-    from roadscan.store.codecs.parquet.number_table import write_number_table
+    from roadscan.store.codecs.parquet.tables import write_number_table
 
     write_number_table(path, rows.replace_schema_metadata(about), group_rows, runs)
 

@@ -16,8 +16,8 @@ WRITE = """
 import sys
 from pathlib import Path
 import numpy as np, pyarrow as pa
-from roadscan.store.codecs.parquet.list_table import write_list_table
-from roadscan.store.codecs.parquet.number_table import write_number_groups, write_number_table
+from roadscan.store.codecs.parquet.tables import write_list_table
+from roadscan.store.codecs.parquet.tables import write_number_groups, write_number_table
 from roadscan.store.codecs.zlib_stream import compressed, crc32
 folder = Path(sys.argv[1])
 rng = np.random.default_rng(0)

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from roadscan.core.errors import StoreError
-from roadscan.store.codecs.parquet.list_table import is_list_table
+from roadscan.store.codecs.parquet.tables import is_list_table
 from roadscan.store.readings.row_groups import ProfileReader, Profiles, read_groups
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store

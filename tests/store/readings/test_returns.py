@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from roadscan.core.errors import StoreError
-from roadscan.store.codecs.parquet.number_table import is_number_table, write_number_table
+from roadscan.store.codecs.parquet.tables import is_number_table, write_number_table
 from roadscan.store.readings.row_groups import Returns, ReturnsReader
 from roadscan.store.schema import table_schema
 from roadscan.store.store import Store

@@ -21,7 +21,7 @@ from roadscan.core.private_folder import sources_digest
 from roadscan.core.survey import LogConfig, Survey
 from roadscan.core.witness import Finding, Witness
 from roadscan.ingest.inspect.diagnosis import cannot_be_opened, claimed_format, is_there
-from roadscan.ingest.reading.format import ENTRY_POINT_GROUP, LogFormat, format_alone
+from roadscan.ingest.reading.format import ENTRY_POINT_GROUP, LogFormat, format_named
 from roadscan.store.digest import checked_json, digest_holds, file_digest, parse_checked
 from roadscan.store.logs import LogRecord
 from roadscan.store.store import Store
@@ -70,9 +70,9 @@ class Sources:
                 raise cannot
             stated = stated or str(self._before[self._name(path)]["format"])
         if stated:
-            return format_alone(stated)
+            return format_named(stated)
         claimed = claimed_before(path, self._before.get(self._name(path)))
-        found = format_alone(claimed) if claimed else claimed_format(path)
+        found = format_named(claimed) if claimed else claimed_format(path)
         self._claims[self._name(path)] = claims_digest()
         return found
 

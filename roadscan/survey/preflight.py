@@ -44,7 +44,7 @@ from roadscan.ingest.inspect.diagnosis import cannot_be_opened, claimed_format, 
 from roadscan.ingest.overlap import LookedAt, NothingPlacedError, key_of_look, look_at, named, never_meeting, no_row
 from roadscan.ingest.place_checks import without_fix
 from roadscan.ingest.planned_logs import CONTROL_RUN, log_options, log_source, plan_logs
-from roadscan.ingest.reading.format import LogFormat, LogHeader, LogSource, Reject, Rows, format_alone
+from roadscan.ingest.reading.format import LogFormat, LogHeader, LogSource, Reject, Rows, format_named
 from roadscan.ingest.sources import claimed_before, listed_name, remembered_logs
 from roadscan.navigation.odometry import LIBRARY, WHAT
 from roadscan.navigation.tasks.clocks import check_clocks
@@ -757,14 +757,14 @@ def _checked(survey: Survey, run: str, config: LogConfig | ControlConfig, logs: 
     path = survey.resolve(config.path)
     known = logs.get(listed_name(path, survey.folder))
     if not is_there(path) and known is not None:
-        return CheckedLog(run, config, path, format_alone(config.format or known["format"]))
+        return CheckedLog(run, config, path, format_named(config.format or known["format"]))
     format_: LogFormat | None = None
     source: LogSource | None = None
     try:
         if cannot := cannot_be_opened(path):
             raise cannot
         stated = config.format or claimed_before(path, known)
-        format_ = format_alone(stated) if stated else claimed_format(path)
+        format_ = format_named(stated) if stated else claimed_format(path)
         options = log_options(survey, config, format_, path)
         source = log_source(survey, config, path, format_, options)
         for file in format_.companions(path, options):

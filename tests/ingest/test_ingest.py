@@ -18,7 +18,7 @@ from blake3 import blake3
 from roadscan.core.errors import ConfigError, RunError, StoreError
 from roadscan.core.survey import Survey
 from roadscan.ingest.ingest import ingest
-from roadscan.ingest.reading.format import format_alone, known_format, log_formats
+from roadscan.ingest.reading.format import format_named, known_format, log_formats
 from roadscan.ingest.sources import claimed_before, remembered_logs
 from roadscan.run.engine.compute import Compute, Done, Inline, R, T
 from roadscan.run.session import Session
@@ -210,7 +210,7 @@ def test_a_format_found_alone_is_the_one_among_all() -> None:
         assert type(known_format(name)) is type(one)
     assert known_format("no_such_format") is None
     with pytest.raises(ConfigError, match=r"unknown format 'sbett'.*sbet"):
-        format_alone("sbett")
+        format_named("sbett")
 
 
 def test_a_disk_that_cannot_read_a_log_costs_that_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,8 +20,9 @@ from roadscan.condition.lane_data import SQUARE_M
 from roadscan.condition.road_line import Lane, RoadLine, Roads
 from roadscan.condition.settings import ConditionConfig, SectionConfig
 from roadscan.condition.survey_lane import LaneHeights, reach_m, survey_lane
+from roadscan.condition.tasks.tasks import tiles_of
 from roadscan.core.errors import ConfigError, StoreError
-from roadscan.core.grid import Bounds, TileGrid, TileId
+from roadscan.core.grid import TileGrid, TileId
 from roadscan.core.survey import Survey
 from roadscan.run.engine.compute import damaged_file, reason_of
 from roadscan.run.keys import code_digest, key_of
@@ -189,12 +190,7 @@ def _on_the_way(
     east, north = (np.interp(at, nodes, coordinate) for coordinate in line.nodes_m.T)
     middle = np.column_stack([east + beside * across, north - beside * along])
     strip = shapely.LineString(middle).buffer(lane.width_m / 2 + reach_m(config, grid.cell_m) + 0.2)
-    west, south, east, north = strip.bounds
-    return [t for t in grid.tiles_in(Bounds(west, south, east, north)) if strip.intersects(_box(grid.bounds(t)))]
-
-
-def _box(b: Bounds) -> shapely.Polygon:
-    return shapely.box(b.easting_min_m, b.northing_min_m, b.easting_max_m, b.northing_max_m)
+    return tiles_of(strip, grid)
 
 
 def due_stretches(stretches: Sequence[Stretch], manifest: Manifest) -> list[Stretch]:

@@ -26,7 +26,7 @@ from roadscan.ingest.inspect.diagnosis import cannot_be_opened, diagnose, format
 from roadscan.ingest.inspect.file_kinds import FileKind, is_cut_off, kind_of, wrapper_of
 from roadscan.ingest.inspect.log_figures import Fault, LogFigures, TableFigures
 from roadscan.ingest.inspect.provisional import OpenedLog, Stated, raw_stamps_ns
-from roadscan.ingest.reading.format import Contents, Item, LogFormat, Rows, format_alone, log_formats
+from roadscan.ingest.reading.format import Contents, Item, LogFormat, Rows, format_named, log_formats
 from roadscan.ingest.reading.stamps import FutureTimes
 
 QUICK_VALUES: Final = 1_000_000
@@ -211,7 +211,7 @@ def inspect(
     ConfigError
         where there is no format of that name. All that is wrong with the file stands in the result.
     """
-    wanted = [format_alone(format_name)] if format_name else None
+    wanted = [format_named(format_name)] if format_name else None
     with tempfile.TemporaryDirectory(prefix="roadscan-inspect-") as scratch:
         return _inspect(path, stated or Stated(), wanted, quick, progress, Path(scratch))
 
@@ -299,7 +299,7 @@ def _look(
             if not candidates:
                 found.error = f"{path}: {contents.what}, of which no raw format reads one"
             return found
-        candidates = [format_alone(chosen[0].format)]
+        candidates = [format_named(chosen[0].format)]
         found.formats = (chosen[0].format,)
     for candidate in candidates:
         found.what = found.what or candidate.title

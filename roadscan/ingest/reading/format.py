@@ -469,20 +469,12 @@ def known_format(name: str) -> LogFormat | None:
     return None if kind is None else kind()
 
 
-def format_alone(name: str) -> LogFormat:
-    """Return a format by name as :func:`format_named` does, without importing the others where it is known.
-
-    It stands beside that one because calibrations are keyed by the code of that one, and would be computed anew.
-    """
-    return known_format(name) or format_named(name)
-
-
 def format_named(name: str) -> LogFormat:
-    """Return a format by name, or raise an error that names the nearest known one."""
+    """Return a format by name, or raise an error that names the nearest known one; only then are all imported."""
+    if found := known_format(name):
+        return found
     formats = log_formats()
-    if name not in formats:
-        raise ConfigError(f"unknown format '{name}'{nearest(name, formats)}", expected="one of: " + ", ".join(formats))
-    return formats[name]
+    raise ConfigError(f"unknown format '{name}'{nearest(name, formats)}", expected="one of: " + ", ".join(formats))
 
 
 def format_of(path: Path) -> LogFormat:

@@ -28,7 +28,7 @@ from roadscan.tiles.products.raster import (
     dated,
     height_unit,
     index_name,
-    index_output,
+    outputs_of_bands,
     sheet_of,
     unknown_output,
     write_index,
@@ -280,13 +280,7 @@ class SurfaceMosaic(SurveyProduct):
     def outputs(self, tiles: Sequence[TileId], options: Strict, context: ProductContext) -> list[Output]:
         """Returns the sheets of each band, followed by the index that joins them."""
         settings = cast(SurfaceMosaicOptions, options)
-        edge_m = sheet_edge_m(settings.sheet_m, context)
-        found: list[Output] = []
-        for band in settings.bands:
-            sheets = cut_sheets(band, tiles, edge_m, context.grid)
-            found += [Output(sheet.name, sheet.tiles) for sheet in sheets]
-            found += index_output(band, sheets)
-        return found
+        return outputs_of_bands(settings.bands, tiles, sheet_edge_m(settings.sheet_m, context), context.grid)
 
     def write(
         self,

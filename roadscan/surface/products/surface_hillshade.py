@@ -30,13 +30,15 @@ from roadscan.surface.products.surface import (
 from roadscan.surface.tile import EMPTY, SurfaceTile
 from roadscan.tiles.product import LoadCells, Output, ProductContext, SurfaceProduct, SurveyProduct, TileSummary
 from roadscan.tiles.products.hillshade import (
+    PICTURE,
     PNG_SIGNATURE,
     SHADE_BAND,
+    STEM,
     HillshadeOptions,
     MeanPixels,
     shade,
+    shaded_outputs,
     with_empty_rim,
-    with_neighbours,
     write_picture,
 )
 from roadscan.tiles.products.raster import (
@@ -45,14 +47,10 @@ from roadscan.tiles.products.raster import (
     cut_sheets,
     dated,
     index_name,
-    index_output,
     sheet_of,
     unknown_output,
     write_index,
 )
-
-_STEM: Final = "hillshade"
-_PICTURE: Final = "hillshade.png"
 
 
 class SurfaceHillshade(SurveyProduct):
@@ -76,12 +74,7 @@ class SurfaceHillshade(SurveyProduct):
     def outputs(self, tiles: Sequence[TileId], options: Strict, context: ProductContext) -> list[Output]:
         """Returns sheets, the index that joins them, and the picture."""
         edge_m = sheet_edge_m(cast(HillshadeOptions, options).sheet_m, context)
-        everything = tuple(sorted(tiles))
-        sheets = cut_sheets(_STEM, everything, edge_m, context.grid)
-        known = frozenset(everything)
-        found = [Output(sheet.name, with_neighbours(sheet, known)) for sheet in sheets]
-        found += index_output(_STEM, sheets)
-        return [*found, Output(_PICTURE, everything)] if everything else []
+        return shaded_outputs(tiles, edge_m, context.grid)
 
     def write(
         self,
@@ -95,11 +88,11 @@ class SurfaceHillshade(SurveyProduct):
         """Write one sheet, the index, or the picture."""
         settings = cast(HillshadeOptions, options)
         edge_m = sheet_edge_m(settings.sheet_m, context)
-        sheet = sheet_of(_STEM, output, edge_m, context.grid)
-        if output.name == index_name(_STEM):
-            sheets = cut_sheets(_STEM, output.tiles, edge_m, context.grid)
+        sheet = sheet_of(STEM, output, edge_m, context.grid)
+        if output.name == index_name(STEM):
+            sheets = cut_sheets(STEM, output.tiles, edge_m, context.grid)
             write_index(path, sheets, SHADE_BAND, "uint8", context, partial(surface_box, context=context))
-        elif output.name == _PICTURE:
+        elif output.name == PICTURE:
             _write_picture(output, SurfaceFiles(load_cells, context), settings, path)
         elif sheet is not None:
             files = SurfaceFiles(load_cells, dated(context, tiles, output.tiles))

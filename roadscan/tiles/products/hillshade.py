@@ -14,7 +14,7 @@ import numpy.typing as npt
 from pydantic import Field
 
 from roadscan.compute.array_types import Float64, Int64
-from roadscan.core.grid import TileId
+from roadscan.core.grid import TileGrid, TileId
 from roadscan.core.strict import Strict
 from roadscan.store.codecs.cog import Band, raster_settings, without_place_warning
 from roadscan.store.codecs.image_files import check_picture
@@ -97,8 +97,8 @@ def _in_memory(*bands: npt.NDArray[np.uint8]) -> Iterator[Any]:
         yield raster
 
 
-_STEM: Final = "hillshade"
-_PICTURE: Final = "hillshade.png"
+STEM: Final = "hillshade"
+PICTURE: Final = "hillshade.png"
 _HEIGHT: Final = "height_robust_m"  # Column of cells that is drawn.
 SHADE_BAND: Final = Band("hillshade", "")
 
@@ -136,13 +136,7 @@ class Hillshade(SurveyProduct):
 
     def outputs(self, tiles: Sequence[TileId], options: Strict, context: ProductContext) -> list[Output]:
         """Sheets, the index that joins them, and the picture."""
-        sheet_m = cast(HillshadeOptions, options).sheet_m
-        sheets = cut_sheets(_STEM, tiles, sheet_m, context.grid)
-        everything = tuple(sorted(tiles))
-        known = frozenset(everything)
-        found = [Output(sheet.name, with_neighbours(sheet, known)) for sheet in sheets]
-        found += index_output(_STEM, sheets)
-        return [*found, Output(_PICTURE, everything)] if everything else []
+        return shaded_outputs(tiles, cast(HillshadeOptions, options).sheet_m, context.grid)
 
     def write(
         self,
@@ -155,11 +149,11 @@ class Hillshade(SurveyProduct):
     ) -> None:
         """Write one sheet, the index, or the picture."""
         settings = cast(HillshadeOptions, options)
-        sheet = sheet_of(_STEM, output, settings.sheet_m, context.grid)
-        if output.name == index_name(_STEM):
-            sheets = cut_sheets(_STEM, output.tiles, settings.sheet_m, context.grid)
+        sheet = sheet_of(STEM, output, settings.sheet_m, context.grid)
+        if output.name == index_name(STEM):
+            sheets = cut_sheets(STEM, output.tiles, settings.sheet_m, context.grid)
             write_index(path, sheets, SHADE_BAND, "uint8", context)
-        elif output.name == _PICTURE:
+        elif output.name == PICTURE:
             _write_picture(sorted(output.tiles), load_cells, settings, context, path)
         elif sheet is not None:
             surface = Surface(output.tiles, base_below(tiles, output), load_cells)
@@ -233,6 +227,15 @@ def shade(
 def with_empty_rim(heights_m: Float64) -> Float64:
     """Return (rows + 2, columns + 2) heights with unknown ones around them."""
     return np.pad(heights_m, 1, constant_values=np.nan)
+
+
+def shaded_outputs(tiles: Sequence[TileId], sheet_m: float | None, grid: TileGrid) -> list[Output]:
+    """Return sheets with the neighbours that their slopes need, the index that joins them, and the picture of all."""
+    everything = tuple(sorted(tiles))
+    sheets, known = cut_sheets(STEM, everything, sheet_m, grid), frozenset(everything)
+    found = [Output(sheet.name, with_neighbours(sheet, known)) for sheet in sheets]
+    found += index_output(STEM, sheets)
+    return [*found, Output(PICTURE, everything)] if everything else []
 
 
 def with_neighbours(sheet: Sheet, everything: frozenset[TileId]) -> tuple[TileId, ...]:

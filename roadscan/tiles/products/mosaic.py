@@ -27,7 +27,7 @@ from roadscan.tiles.products.raster import (
     dated,
     in_unit,
     index_name,
-    index_output,
+    outputs_of_bands,
     paste_tile,
     sheet_of,
     unknown_output,
@@ -61,13 +61,8 @@ class Mosaic(SurveyProduct):
 
     def outputs(self, tiles: Sequence[TileId], options: Strict, context: ProductContext) -> list[Output]:
         """Sheets of each quantity, followed by the index that joins them."""
-        found: list[Output] = []
         settings = cast(MosaicOptions, options)
-        for quantity in settings.quantities:
-            sheets = cut_sheets(quantity, tiles, settings.sheet_m, context.grid)
-            found += [Output(sheet.name, sheet.tiles) for sheet in sheets]
-            found += index_output(quantity, sheets)
-        return found
+        return outputs_of_bands(settings.quantities, tiles, settings.sheet_m, context.grid)
 
     def write(
         self,

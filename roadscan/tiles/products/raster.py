@@ -315,6 +315,18 @@ def index_output(stem: str, sheets: Sequence[Sheet]) -> list[Output]:
     return [Output(index_name(stem), tuple(sorted({tile for sheet in sheets for tile in _outermost(sheet.tiles)})))]
 
 
+def outputs_of_bands(
+    names: Iterable[str], tiles: Sequence[TileId], sheet_m: float | None, grid: TileGrid
+) -> list[Output]:
+    """Return the sheets of each band, followed by the index that joins them."""
+    found: list[Output] = []
+    for name in names:
+        sheets = cut_sheets(name, tiles, sheet_m, grid)
+        found += [Output(sheet.name, sheet.tiles) for sheet in sheets]
+        found += index_output(name, sheets)
+    return found
+
+
 def _outermost(tiles: Sequence[TileId]) -> set[TileId]:
     """Return up to four tiles that span the same box as all."""
     by_column = sorted(tiles)

@@ -18,7 +18,7 @@ from roadscan.core.grid import TileGrid, TileId
 from roadscan.core.rig import Mountings, ScanGeometry, Sensor
 from roadscan.georeference.charts import charts_along
 from roadscan.georeference.cloud import TilePoints
-from roadscan.georeference.kernels.readings import FATES, Placed, Returns
+from roadscan.georeference.kernels.readings import FATES, Georeferenced, Returns
 from roadscan.georeference.kernels.timed_readings import CHUNK, place_returns
 from roadscan.georeference.place import EVERYWHERE, HeightLimits, Placement
 from roadscan.poses.trajectory import Trajectory
@@ -72,7 +72,7 @@ def figures(_: Path) -> Iterator[Figure]:
         proj,
         "PROJ, the map step alone",
     )
-    places = Placed(*np.empty((3, CHUNK)), np.empty(CHUNK, np.uint8), np.empty(CHUNK, np.int32))
+    places = Georeferenced(*np.empty((3, CHUNK)), np.empty(CHUNK, np.uint8), np.empty(CHUNK, np.int32))
     yield Figure(
         "lidar returns, placed only (no rows written)",
         rate(N, lambda: placed_only(placement, batch, places)),
@@ -153,7 +153,7 @@ def mirror_profiles(path: Trajectory) -> tuple[pa.RecordBatch, ScanGeometry]:
     return pa.RecordBatch.from_pydict({"epoch_gps_ns": epochs, "range": lists[0], "intensity": lists[1]}), geometry
 
 
-def placed_only(placement: Placement, batch: pa.RecordBatch, places: Placed) -> None:
+def placed_only(placement: Placement, batch: pa.RecordBatch, places: Georeferenced) -> None:
     """What every way from returns to points or cells begins with."""
     columns = [batch.column(c).to_numpy() for c in ("pose_epoch_gps_ns", "x_sensor_m", "y_sensor_m", "z_sensor_m")]
     ((_, mounting),) = placement.mountings.pieces(columns[0])

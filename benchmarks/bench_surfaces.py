@@ -28,7 +28,7 @@ from roadscan.calibrate.estimator import Calibration, calibrate
 from roadscan.calibrate.evidence import Evidence, Orientation
 from roadscan.calibrate.surfaces.heights import HeightTies
 from roadscan.calibrate.surfaces.objects import HeadTies, cell_heights
-from roadscan.calibrate.surfaces.planes import Placed, PlaneTies, level_from_world, placed
+from roadscan.calibrate.surfaces.planes import LevelPoints, PlaneTies, level_from_world, placed
 from roadscan.calibrate.unknowns import Estimate
 from roadscan.core.settings.calibration import CalibrationSettings
 
@@ -145,7 +145,7 @@ def overlap_mm(yard: Yard, found: Calibration) -> float:
     return 1e3 * float(np.sqrt(np.mean([_beyond_noise_m2(a, b) for a, b in by_drive.values()])))
 
 
-def _beyond_noise_m2(first: Placed, second: Placed) -> float:
+def _beyond_noise_m2(first: LevelPoints, second: LevelPoints) -> float:
     """Mean squared difference (m²) of two heads in cells that both see, less the scatter of the readings within them.
 
     Cells across an edge have no one height and are left out: those whose readings scatter far more than usual.

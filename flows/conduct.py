@@ -24,7 +24,7 @@ from roadscan.run.engine.compute_on import compute_on
 from roadscan.run.progress import LineReporter
 from roadscan.run.session import Selection, Session
 from roadscan.run.stage import Stage, stages
-from roadscan.run.told import Asked, told_run
+from roadscan.run.told import Asked, reported_run
 from roadscan.store.store import Store
 from roadscan.survey.preflight import preflight
 from roadscan.survey.run import close_run, run_stage
@@ -89,7 +89,7 @@ def conduct(
         store = Store(survey.store_url, survey.config.id)
         store.check_free()
         run = Session(survey, store, selection=selection, reporter=FlowReporter())
-        with told_run(run, [stage.name for stage in stages()], Asked.of(events, metrics)):
+        with reported_run(run, [stage.name for stage in stages()], Asked.of(events, metrics)):
             preflight(survey, store, selection=selection).begin(run.reporter.line)
             with store.lock(), compute_on(workers, scheduler) as run.compute:
                 for stage in stages():

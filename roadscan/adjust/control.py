@@ -380,7 +380,7 @@ class WrongPoint:
     alternatives: tuple[str, ...] = ()
     """Points that may be wrong instead."""
 
-    def told(self) -> str:
+    def in_words(self) -> str:
         """Returns the fault in words."""
         parts, what = [], []
         if np.isfinite(self.height_m):

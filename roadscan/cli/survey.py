@@ -41,10 +41,10 @@ def run_survey(
     """
     from roadscan.core.stopping import Stopped
     from roadscan.run.engine.compute_on import compute_on
-    from roadscan.run.progress import compiling_told
+    from roadscan.run.progress import reporting_compilation
     from roadscan.run.session import Session
     from roadscan.run.stage import stages
-    from roadscan.run.told import Asked, told_run
+    from roadscan.run.told import Asked, reported_run
     from roadscan.survey.preflight import preflight
     from roadscan.survey.run import run_stages
 
@@ -58,7 +58,7 @@ def run_survey(
         reporter.line(f"dashboard: {address}")
 
     asked = Asked.of(where.events, where.metrics)
-    with told_run(run, [stage.name for stage in chosen], asked), compiling_told(run.reporter):
+    with reported_run(run, [stage.name for stage in chosen], asked), reporting_compilation(run.reporter):
         preflight(run.survey, run.store, chosen[-1].name, selection).begin(run.reporter.line)
         with compute_on(where.workers, where.scheduler, at if where.dashboard else None) as run.compute:
             try:

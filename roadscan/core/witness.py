@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any, Final, Literal
 
-Told = Literal["error", "rejects", "findings"]
+ReportedIn = Literal["error", "rejects", "findings"]
 """Where a fault is reported: ``error`` ends the command or the log with a message; ``rejects`` counts the records in
 the summary and lists each in the table `rejects`; ``findings`` is a line of summary, `status` and report."""
 
@@ -29,7 +29,7 @@ class Witness:
     """The witness: what the input is compared with."""
     does: str
     """What the run does on a contradiction: what is left out, refused or kept."""
-    told: tuple[Told, ...]
+    told: tuple[ReportedIn, ...]
     """Where the result is reported."""
 
     def finds(self, subject: str, text: str, left_out: int = 0) -> Finding:

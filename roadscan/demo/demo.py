@@ -268,7 +268,7 @@ def compare_epochs(survey_file: Path, edit: HandEdit) -> list[str]:
     is_in_force = row.get(edit.attribute) == edit.given
     lines = [f"inventory     {shown.home}: {shown.assets} assets of {SPRING} and {AUTUMN}"]
     if changes is not None:
-        lines += [f"on the street {line}" for line in _told(changes.changes)]
+        lines += [f"on the street {line}" for line in _lines_of(changes.changes)]
         unseen = counted(changes.unseen, "asset")
         lines.append(f"not in sight  {unseen}: the second survey says nothing of it, so it counts as there")
     lines.append(
@@ -279,7 +279,7 @@ def compare_epochs(survey_file: Path, edit: HandEdit) -> list[str]:
     return lines
 
 
-def _told(changes: tuple[Change, ...]) -> Iterator[str]:
+def _lines_of(changes: tuple[Change, ...]) -> Iterator[str]:
     """Changes of the street in words; values that were measured anew are left out."""
     for one in changes:
         words: dict[str, Any] = {

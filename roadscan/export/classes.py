@@ -18,7 +18,7 @@ from roadscan.core.errors import ConfigError, nearest
 from roadscan.core.grid import LanePass, TileId
 from roadscan.core.rig import ScanGeometry
 from roadscan.core.survey import Survey
-from roadscan.georeference.place import Placed, passes_of
+from roadscan.georeference.place import Georeferenced, passes_of
 from roadscan.georeference.plan.plan import SurveyPlan, plan_survey
 from roadscan.georeference.plan.road import CentreLineBuffer, load_buffer
 from roadscan.georeference.road_profiles import KEPT, OFF_CENTRE_LINE, OUTSIDE_PASS, READING_CLASSES
@@ -151,7 +151,7 @@ def _numbered(rows: pa.RecordBatch, first: int, geometry: ScanGeometry | None) -
 def _beside(
     classes: UInt8,
     epochs_gps_ns: Int64,
-    kept: Placed,
+    kept: Georeferenced,
     passes: list[LanePass],
     lines: CentreLineBuffer | None,
     plan: SurveyPlan,
@@ -168,7 +168,7 @@ def _beside(
         classes[placed[off]] = OFF_CENTRE_LINE
 
 
-def _near(points: Placed, lines: CentreLineBuffer, plan: SurveyPlan) -> npt.NDArray[np.bool_]:
+def _near(points: Georeferenced, lines: CentreLineBuffer, plan: SurveyPlan) -> npt.NDArray[np.bool_]:
     """Return which points (n,) lie in the buffer, tile by tile as in products."""
     tiles, tile_of = np.unique(points.tiles, axis=0, return_inverse=True)
     order = np.argsort(tile_of, kind="stable")

@@ -97,7 +97,7 @@ EVERYWHERE: Final = Window(-(2**30), -(2**30), 2**30, 2**30)  # Contains every t
 
 
 @dataclass(frozen=True)
-class Placed:
+class Georeferenced:
     """Points of one batch of readings, in the order of the batch."""
 
     tiles: Int32
@@ -172,11 +172,11 @@ class Placement:
         """(knots − 1, 2) largest horizontal and vertical 1 σ of the poses of each interval; inf where not known."""
         return self.trajectory.interval_sigmas_m()
 
-    def returns(self, batch: pa.RecordBatch, window: Window, *, marked: bool = False) -> Placed:
+    def returns(self, batch: pa.RecordBatch, window: Window, *, marked: bool = False) -> Georeferenced:
         """Georeference rows of the table ``returns``; `marked`: include filtered ones, with their classes."""
         work = self._work(batch, None, window, marked)
         kept = work.rows
-        return Placed(
+        return Georeferenced(
             work.tiles,
             work.quanta,
             _numpy(batch, "epoch_gps_ns")[kept],
@@ -188,7 +188,7 @@ class Placement:
 
     def profiles(
         self, batch: pa.RecordBatch, geometry: ScanGeometry, window: Window, *, marked: bool = False
-    ) -> Placed:
+    ) -> Georeferenced:
         """Georeference rows of the table ``scans``; `marked` as for :meth:`returns`."""
         work = self._work(batch, geometry, window, marked)
         row, reading = work.rows, work.readings
@@ -199,7 +199,7 @@ class Placement:
             intensity = digital.astype(np.uint16) * EIGHT_TO_SIXTEEN_BITS
         classes = None if work.classes is None else work.classes[row.astype(np.int64) * geometry.readings + reading]
         # Copied, because the working arrays are far larger where a window keeps little.
-        return Placed(
+        return Georeferenced(
             work.tiles.copy(), work.quanta.copy(), epoch, intensity, np.ones(row.size, np.uint8), work.fates, classes
         )
 
@@ -350,7 +350,7 @@ def place_cloud(
     window: Window,
     *,
     marked: bool = False,
-) -> Placed:
+) -> Georeferenced:
     """Convert rows of the table ``cloud``, whose points are already georeferenced.
 
     Of the filters only the absolute heights hold for them. `marked`: those too that these leave out, with their
@@ -368,7 +368,7 @@ def place_cloud(
     keep = wanted & (high if not marked else HeightLimits().classes(enh[:, 2]) == KEPT)
     quanta = np.column_stack([whole[:, :2] - tiles * tile_quanta, whole[:, 2]])[keep].astype(np.int32)
     fates = np.array([(high & wanted).sum(), 0, 0, (~high).sum(), (high & ~wanted).sum(), 0], dtype=np.int64)
-    return Placed(
+    return Georeferenced(
         tiles[keep].astype(np.int32),
         quanta,
         _numpy(batch, "epoch_gps_ns")[keep],

@@ -23,9 +23,9 @@ from roadscan.georeference.charts import Charts, charts_along
 from roadscan.georeference.place import (
     EVERYWHERE,
     CloudFrame,
+    Georeferenced,
     HeightLimits,
     Located,
-    Placed,
     Placement,
     Window,
     cloud_classes,
@@ -183,7 +183,7 @@ class Georeferencer:
             if source.trajectory is not None:
                 self._placements[key] = self._placement(source, spans[key])
 
-    def place(self, one: RawSlice, window: Window) -> Iterator[tuple[int, Placed]]:
+    def place(self, one: RawSlice, window: Window) -> Iterator[tuple[int, Georeferenced]]:
         """Yield points of a slice, chunk by chunk, with the row group each chunk starts with."""
         for groups in _chunks(one):
             rows = read_rows(self._store, one.source, one.file, groups).combine_chunks()
@@ -224,7 +224,7 @@ class Georeferencer:
         arm = min(farthest_m(batch, geometry_of(source)), source.range_max_m) + source.mountings.longest_lever_m()
         return math.ceil(_MAP_SCALE * source.allowance.moved_m(arm) / self._ground.grid.size_m)
 
-    def classified(self, one: RawSlice) -> Iterator[tuple[pa.RecordBatch, npt.NDArray[np.uint8], Placed]]:
+    def classified(self, one: RawSlice) -> Iterator[tuple[pa.RecordBatch, npt.NDArray[np.uint8], Georeferenced]]:
         """Yield rows of a slice, chunk by chunk, with the class of every reading in order, and the points kept.
 
         Passes and centre lines are ignored.
@@ -239,7 +239,7 @@ class Georeferencer:
             return cloud_classes(batch, _cloud_frame(source), self._ground.map, self._ground.heights)
         return self._placements[source.key].classes(batch, geometry_of(source))
 
-    def _place_batch(self, source: ReadingSource, batch: pa.RecordBatch, window: Window, marked: bool) -> Placed:
+    def _place_batch(self, source: ReadingSource, batch: pa.RecordBatch, window: Window, marked: bool) -> Georeferenced:
         ground = self._ground
         if source.table == "cloud":
             cloud = _cloud_frame(source)

@@ -172,9 +172,9 @@ class _Recording:
         arrays = [columns.get(f.name, pa.nulls(count, f.type)) for f in schema]
         return pa.table(dict(zip(schema.names, arrays, strict=True))).cast(schema)
 
-    def _placed(self, seen: Mapping[str, pa.Table]) -> dict[str, Placed]:
+    def _placed(self, seen: Mapping[str, pa.Table]) -> dict[str, AssetPlaces]:
         """Returns assets of all kinds: those that were just found first, then the other known ones."""
-        placed: dict[str, Placed] = {}
+        placed: dict[str, AssetPlaces] = {}
         for kind in {*seen, *self.state.assets}:
             ids: list[Any] = []
             shapes: list[Any] = []
@@ -190,7 +190,7 @@ class _Recording:
             array = np.array(shapes, dtype=object)
             if self.rules.unit_m != 1.0:
                 array = shapely.transform(array, lambda xy: xy * self.rules.unit_m)
-            placed[kind] = Placed(np.array(ids, dtype=str), array)
+            placed[kind] = AssetPlaces(np.array(ids, dtype=str), array)
         return placed
 
 
@@ -235,19 +235,19 @@ _REACH_M: Final = 1.0
 """Greatest horizontal distance (m) of a point or line to its parent."""
 
 
-class Placed(NamedTuple):
+class AssetPlaces(NamedTuple):
     """Assets of a kind with their places, in metres of the map."""
 
     ids: npt.NDArray[Any]
     shapes: npt.NDArray[Any]
 
-    def without(self, ids: Sequence[str]) -> Placed:
+    def without(self, ids: Sequence[str]) -> AssetPlaces:
         """Returns the same without some of them."""
         keep = ~np.isin(self.ids, ids)
-        return Placed(self.ids[keep], self.shapes[keep])
+        return AssetPlaces(self.ids[keep], self.shapes[keep])
 
 
-def parents_of(kind: str, placed: Mapping[str, Placed]) -> list[str | None]:
+def parents_of(kind: str, placed: Mapping[str, AssetPlaces]) -> list[str | None]:
     """Returns the id of the parent of each asset of a kind, None where none is within 1 m of it.
 
     The kind that the schema names first wins, then the nearest asset, then the lower id.

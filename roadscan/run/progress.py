@@ -132,7 +132,7 @@ class TerminalReporter(Shown):
 
 
 @contextlib.contextmanager
-def compiling_told(reporter: Reporter) -> Iterator[None]:
+def reporting_compilation(reporter: Reporter) -> Iterator[None]:
     """Tell every few seconds which kernels this machine compiles meanwhile: a first run does so for a minute.
 
     Whatever process compiles one, it puts it into the cache that all share.

@@ -336,7 +336,7 @@ class Asked(NamedTuple):
 
 
 @contextlib.contextmanager
-def told_run(session: Session, stages: Sequence[str], asked: Asked | None = None) -> Iterator[None]:
+def reported_run(session: Session, stages: Sequence[str], asked: Asked | None = None) -> Iterator[None]:
     """Tell of a run to its history and to those that are asked for; within a run that is told, do nothing more."""
     if session.teller is not None:
         yield
@@ -356,7 +356,7 @@ def told_run(session: Session, stages: Sequence[str], asked: Asked | None = None
 
 
 @contextlib.contextmanager
-def told_stage(session: Session, stage: str) -> Iterator[None]:
+def reported_stage(session: Session, stage: str) -> Iterator[None]:
     """Tell of a stage and of its tasks, where the run is told."""
     if session.teller is None:
         yield

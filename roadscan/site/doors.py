@@ -162,7 +162,7 @@ class MeasuringDoor:
                 place = log.run, log.sensor, pictures.files[number], asked.point
                 self._clicked.put(place, asked.pixel, asked.before)
             answer = {
-                "file": self._clicked.file.name, "points": [_told(row) for row in points],
+                "file": self._clicked.file.name, "points": [_shown(row) for row in points],
                 "measured": [_measured(row) for row in self._clicked.rows()], "missing": self._missing(),
             }  # fmt: skip
             if asked.action == "show":
@@ -220,7 +220,7 @@ def _values(content: bytes) -> dict[str, Any]:
     return values
 
 
-def _told(row: dict[str, Any]) -> dict[str, Any]:
+def _shown(row: dict[str, Any]) -> dict[str, Any]:
     return {name: row[name] for name in ("name", "role", "easting_m", "northing_m", "height_m")}
 
 

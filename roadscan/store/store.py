@@ -237,7 +237,7 @@ class Store:
         else:
             folder = Path(tempfile.mkdtemp(prefix="roadscan-"))
         try:
-            with told_if_full(folder):
+            with naming_full_disk(folder):
                 yield folder
         finally:
             shutil.rmtree(folder, ignore_errors=True)
@@ -544,7 +544,7 @@ def put_file(fs: Any, path: str, content: bytes) -> None:
 
 
 @contextlib.contextmanager
-def told_if_full(folder: Path) -> Iterator[None]:
+def naming_full_disk(folder: Path) -> Iterator[None]:
     """Report which disk is full where a writer fails for want of room, whatever its library's message.
 
     Raises

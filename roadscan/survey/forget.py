@@ -50,7 +50,7 @@ class Chosen:
 
 
 @dataclass(frozen=True)
-class Told:
+class Outcome:
     """What became of a choice."""
 
     removed: int
@@ -114,7 +114,7 @@ def choose_taken(session: Session, camera: str, first_gps_ns: int | None, last_g
     return [one for one in chosen if one.path.exists()]
 
 
-def forget(session: Session, chosen: Collection[Chosen], why: str, archives: Sequence[str] = ()) -> Told:
+def forget(session: Session, chosen: Collection[Chosen], why: str, archives: Sequence[str] = ()) -> Outcome:
     """Remove pictures, and their copies in archives, and record it (requires the store's lock).
 
     The record comes first, so that nothing goes without one; what a kill left is removed by the same command again.
@@ -143,7 +143,7 @@ def forget(session: Session, chosen: Collection[Chosen], why: str, archives: Seq
             removed += is_there
         except OSError as error:
             left.append(f"{one.path}: {error.strerror}")
-    return Told(removed, archived, tuple(left))
+    return Outcome(removed, archived, tuple(left))
 
 
 def still_there(session: Session) -> list[str]:

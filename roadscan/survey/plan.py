@@ -336,7 +336,7 @@ def _rows(plan: RunPlan) -> list[_Row]:
     rows: list[_Row] = []
     top = _TOP
     for one in plan.stages:
-        title, *details = (textwrap.wrap(text, _LETTERS[0]) for text in _told(one))
+        title, *details = (textwrap.wrap(text, _LETTERS[0]) for text in _lines_of(one))
         lines = [*title, *(line for text in details for line in text)]
         written = textwrap.wrap(", ".join(one.written), _LETTERS[1], break_on_hyphens=False)
         rows.append(_Row(one, lines, written, top, len(title)))
@@ -344,7 +344,7 @@ def _rows(plan: RunPlan) -> list[_Row]:
     return rows
 
 
-def _told(one: PlannedStage) -> Iterator[str]:
+def _lines_of(one: PlannedStage) -> Iterator[str]:
     yield one.title
     if one.is_passed_over:
         yield f"passed over: {one.note}"

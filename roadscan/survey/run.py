@@ -16,7 +16,7 @@ from roadscan.navigation.tasks.navigate import known_keys
 from roadscan.run.engine.compute import damaged_file, rare_collections
 from roadscan.run.session import SelectionError, Session
 from roadscan.run.stage import Stage, findings_of, stages
-from roadscan.run.told import told_run, told_stage
+from roadscan.run.told import reported_run, reported_stage
 from roadscan.store.holders import look_again
 from roadscan.store.logs import read_log_records
 from roadscan.store.manifest import begin_changes, end_changes, write_failures
@@ -42,7 +42,7 @@ def run_stages(session: Session, chosen: Sequence[Stage] | None = None) -> None:
     wanted = stages() if chosen is None else chosen
     wanted_products(session.survey)  # a wrong name or option is reported before a log is read
     check_cameras(session.survey)
-    with told_run(session, [stage.name for stage in wanted]), session.store.lock():
+    with reported_run(session, [stage.name for stage in wanted]), session.store.lock():
         for stage in wanted:
             started = time.perf_counter()
             run_stage(session, stage)
@@ -61,7 +61,7 @@ def run_stage(session: Session, stage: Stage) -> None:
         _tell_upgrade(session)
         session.goes_on = begin_changes(session.store)
         session.began_ns = time.time_ns() - _CLOCK_TICK_NS
-    with told_stage(session, stage.name):
+    with reported_stage(session, stage.name):
         _run_stage(session, stage)
 
 

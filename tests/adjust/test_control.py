@@ -167,6 +167,6 @@ def test_exchanged_heights_are_told_by_what_the_exchange_would_leave() -> None:
 
 def test_a_wrong_point_whose_difference_is_not_known_is_told() -> None:
     nan = float("nan")
-    told = WrongPoint("P2", nan, nan, nan, 500.0, 4.1, 3.8, ("P3",)).told()
+    told = WrongPoint("P2", nan, nan, nan, 500.0, 4.1, 3.8, ("P3",)).in_words()
     assert told.startswith("its survey lies elsewhere from what all other evidence says (4.1 σ")
     assert told.endswith("none of their surveys counts")

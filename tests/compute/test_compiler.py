@@ -157,7 +157,7 @@ class Lines(session.Reporter):
     def line(self, text):
         print(text, flush=True)
 
-with progress.compiling_told(Lines()):
+with progress.reporting_compilation(Lines()):
     import parts
     time.sleep(0.5)
 """

@@ -20,9 +20,9 @@ from roadscan.georeference.kernels.readings import (
     CLASS_TOO_FAR,
     FATES,
     Georeference,
+    Georeferenced,
     Limits,
     MirrorProfiles,
-    Placed,
     Returns,
 )
 from roadscan.georeference.kernels.timed_readings import STEP_NS, place_mirror, place_returns
@@ -49,7 +49,7 @@ def outputs(n: int) -> tuple[np.ndarray, ...]:
 def placed(start: int, end: int, epochs: np.ndarray, xyz: np.ndarray, how: Georeference) -> tuple[np.ndarray, ...]:
     out = outputs(end - start)
     columns = (read_only(np.ascontiguousarray(xyz[:, a])) for a in range(3))
-    place_returns(start, end, Returns(read_only(epochs), *columns), how, Placed(*out[:5]), out[5])
+    place_returns(start, end, Returns(read_only(epochs), *columns), how, Georeferenced(*out[:5]), out[5])
     return out
 
 
@@ -104,7 +104,7 @@ def test_readings_of_a_mirror_lie_where_exact_poses_put_them() -> None:
     path = wild_drive(5_000_000)
     how = mirror(path)
     out = outputs(40 * 181)
-    place_mirror(0, 40, *how, Placed(*out[:5]), out[5])
+    place_mirror(0, 40, *how, Georeferenced(*out[:5]), out[5])
     epochs, ranges, _, directions, *_ = how[0]
     when = (epochs[:, None] + np.floor(np.arange(181) * 37_037.04 + 0.5).astype(np.int64)).ravel()
     xyz = ((0.5 + 0.0015 * ranges)[:, :, None] * directions).reshape(-1, 3)
@@ -143,9 +143,9 @@ def test_no_bit_depends_on_how_returns_are_divided_or_ordered() -> None:
 def test_no_bit_depends_on_how_profiles_of_a_mirror_are_divided() -> None:
     how = mirror(wild_drive(5_000_000), (5.0, 80.0, -1e5, 40.0, -1e5, 1e5))
     whole, one = outputs(40 * 181), outputs(181)
-    place_mirror(0, 40, *how, Placed(*whole[:5]), whole[5])
+    place_mirror(0, 40, *how, Georeferenced(*whole[:5]), whole[5])
     for p in range(40):
-        place_mirror(p, p + 1, *how, Placed(*one[:5]), one[5])
+        place_mirror(p, p + 1, *how, Georeferenced(*one[:5]), one[5])
         kept = one[3] == CLASS_KEPT
         for column in range(5):
             mine = kept if column < 3 else slice(None)

@@ -9,7 +9,14 @@ import pytest
 
 from roadscan.core.grid import TileGrid, TileId
 from roadscan.georeference.cloud import TilePoints
-from roadscan.georeference.kernels.readings import CLASS_KEPT, CLASS_TOO_HIGH, FATES, KEPT, OUTSIDE, Placed
+from roadscan.georeference.kernels.readings import (
+    CLASS_KEPT,
+    CLASS_TOO_HIGH,
+    FATES,
+    KEPT,
+    OUTSIDE,
+    Georeferenced,
+)
 from roadscan.tiles.accumulator import Accumulator, cells_of
 from roadscan.tiles.kernels.row_buckets import TAKEN, ActiveTiles, Buckets, Measured, Places, fill_buckets
 
@@ -45,7 +52,7 @@ def fill(accumulator: Accumulator, p: TilePoints, tile: TileId, fates: Any, clas
             if buckets.free.size - buckets.held[TAKEN] < AT_ONCE:
                 return start
             own = slice(start, start + AT_ONCE)
-            placed = Placed(east[own], north[own], height[own], kinds[own], intervals[own])
+            placed = Georeferenced(east[own], north[own], height[own], kinds[own], intervals[own])
             measured = Measured(p.epoch_gps_ns[own], numbers[own], p.intensity[own], np.uint32(1), sigmas)
             work = [np.empty(AT_ONCE, np.int32) for _ in range(3)]
             places = Places(*work, np.full(len(accumulator.spans), -1, np.int32))

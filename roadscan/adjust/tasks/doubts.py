@@ -124,7 +124,7 @@ _WORDS: Final = {
 
 def wrong_points(wrong: Sequence[WrongPoint]) -> list[Finding]:
     """Returns findings on points that all other evidence contradicts, and on pairs whose heights look exchanged."""
-    found = [CONTROL_POINT.finds(one.name, one.told(), left_out=1 + len(one.alternatives)) for one in wrong]
+    found = [CONTROL_POINT.finds(one.name, one.in_words(), left_out=1 + len(one.alternatives)) for one in wrong]
     return found + exchanged(wrong)
 
 

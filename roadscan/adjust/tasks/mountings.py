@@ -341,8 +341,8 @@ def causes(found: MountingErrors) -> tuple[Cause, ...]:
 def rolls_in_words(rolls: Sequence[Cause]) -> str:
     """Returns rolls of sensors that would explain a shift of the control as well; "" without any."""
     words = [
-        f"a boresight roll of {_called(one.sensor)} that is off by {_told(-one.error, one.component, signed=True)} "
-        f"(σ {_told(one.sigma, one.component)})"
+        f"a boresight roll of {_called(one.sensor)} that is off by {_text(-one.error, one.component, signed=True)} "
+        f"(σ {_text(one.sigma, one.component)})"
         for one in rolls
     ]
     return " and ".join(words)
@@ -353,7 +353,7 @@ def cause_line(found: Sequence[Cause]) -> str:
     if len(found) < 2:
         return ""
     words = [
-        f"{_NAMES[one.component]} of {_called(one.sensor)} {_told(one.error, one.component, signed=True)}"
+        f"{_NAMES[one.component]} of {_called(one.sensor)} {_text(one.error, one.component, signed=True)}"
         for one in found
     ]
     return (
@@ -371,8 +371,8 @@ def mounting_findings(found: MountingErrors | None) -> list[Finding]:
         prior, error = found.prior_sigma[k], found.error[k]
         off = np.flatnonzero(disproved(found)[k])
         if off.size:
-            words = [f"{_NAMES[c]} {_told(error[c], c, signed=True)} (σ {_told(found.sigma[k, c], c)}, "
-                     f"stated σ {_told(prior[c], c)})" for c in off.tolist()]  # fmt: skip
+            words = [f"{_NAMES[c]} {_text(error[c], c, signed=True)} (σ {_text(found.sigma[k, c], c)}, "
+                     f"stated σ {_text(prior[c], c)})" for c in off.tolist()]  # fmt: skip
             like = (
                 " (attitudes of all poses that are turned by as much look the same)"
                 if np.isin(off, list(TURNS.values())).any()
@@ -399,7 +399,7 @@ def mounting_lines(found: MountingErrors | None) -> list[str]:
         determined = (sigma < DETERMINED * prior) | disproved(found)[k]
         known = np.flatnonzero((prior > 0.0) & determined).tolist()
         unknown = np.flatnonzero((prior > 0.0) & ~determined).tolist()
-        words = [f"{_NAMES[c]} {_told(found.error[k, c], c, signed=True)} (σ {_told(sigma[c], c)})" for c in known]
+        words = [f"{_NAMES[c]} {_text(found.error[k, c], c, signed=True)} (σ {_text(sigma[c], c)})" for c in known]
         words += [f"{', '.join(_NAMES[c] for c in unknown)} not determined"] if unknown else []
         lines.append(f"mounting of {_called(sensor)}: {'; '.join(words)}")
     return lines
@@ -410,7 +410,7 @@ def _called(sensor: tuple[str, str]) -> str:
     return name if run == "*" else f"{name} in run '{run}'"
 
 
-def _told(value: float, component: int, *, signed: bool = False) -> str:
+def _text(value: float, component: int, *, signed: bool = False) -> str:
     sign = "+" if signed else ""
     if component == MOUNTED.index("range_scale"):
         return f"{1e2 * value:{sign}.3f} %"

@@ -20,7 +20,7 @@ from pydantic import Field
 
 from roadscan.calibrate.evidence import Seen, Ties, Traverse
 from roadscan.calibrate.kernels.surface_patches import MOMENTS, UNKNOWNS, Matches, match_patches, splat
-from roadscan.calibrate.surfaces.planes import Pieces, Placed, Readings, level_from_world, placed
+from roadscan.calibrate.surfaces.planes import LevelPoints, Pieces, Readings, level_from_world, placed
 from roadscan.calibrate.unknowns import Estimate
 from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.errors import NavigationError
@@ -88,7 +88,7 @@ class HeightSettings(Strict):
 class Image:
     """Heights that one sensor saw in one drive."""
 
-    placed: Placed
+    placed: LevelPoints
     height_m: Float64
     """(rows, columns); NaN where nothing was seen."""
     carrier: npt.NDArray[np.int32]
@@ -206,7 +206,7 @@ def height_ties(
     return [ties for group in by_sensors.values() for ties in _ties(group, turned)]
 
 
-def _images(all_placed: Sequence[Placed], at: HeightLevel) -> list[Image]:
+def _images(all_placed: Sequence[LevelPoints], at: HeightLevel) -> list[Image]:
     low, high = _overlap([one.place_m for one in all_placed])
     columns, rows = (np.ceil((high - low) / at.cell_m).astype(int) + 1).tolist()
     if rows * columns > _MOST_CELLS:
@@ -237,7 +237,7 @@ def _overlap(places: Sequence[Float64]) -> tuple[Float64, Float64]:
     return low, high
 
 
-def _image(one: Placed, corner_m: Float64, rows: int, columns: int, at: HeightLevel) -> Image:
+def _image(one: LevelPoints, corner_m: Float64, rows: int, columns: int, at: HeightLevel) -> Image:
     mass, height = np.zeros((rows, columns)), np.zeros((rows, columns))
     carrier = np.full((rows, columns), -1, dtype=np.int32)
     splat(

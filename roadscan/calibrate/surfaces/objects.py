@@ -22,7 +22,7 @@ import numpy as np
 import scipy
 
 from roadscan.calibrate.evidence import Known, Seen, Ties, Traverse
-from roadscan.calibrate.surfaces.planes import Pieces, Placed, Readings, level_from_world, placed
+from roadscan.calibrate.surfaces.planes import LevelPoints, Pieces, Readings, level_from_world, placed
 from roadscan.calibrate.unknowns import Estimate, ObjectPose
 from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.arrays import scatter_about
@@ -163,7 +163,7 @@ class ObjectTies:
         return [_joined(parts, self.name) for parts in found.values()]
 
     def _of(
-        self, at: Placed, pose: ObjectPose, level: Float64, margin_m: float
+        self, at: LevelPoints, pose: ObjectPose, level: Float64, margin_m: float
     ) -> tuple[Seen, Float64, Float64] | None:
         """Return means of the readings of one sensor and drive in small cells on the tops, and their σ."""
         world = at.place_m @ level - pose.position_world_m
@@ -276,7 +276,7 @@ class HeadTies:
     def __call__(self, estimate: Estimate) -> list[Ties]:
         """Ties of heights, one a cell that both heads of a drive see; none where their profiles do not overlap."""
         level = level_from_world(self.readings)
-        drives: dict[str, list[Placed]] = {}
+        drives: dict[str, list[LevelPoints]] = {}
         for one in self.readings:
             at = placed(one, estimate, self.pieces, self.traverses, level)
             drives.setdefault(one.drive, []).append(at)
@@ -284,7 +284,7 @@ class HeadTies:
         return [ties for first, second in pairs if (ties := _strip(first, second, level)) is not None]
 
 
-def _strip(first: Placed, second: Placed, level_from_world: Float64) -> Ties | None:
+def _strip(first: LevelPoints, second: LevelPoints, level_from_world: Float64) -> Ties | None:
     """Return the ties of two heads in one drive."""
     if first.readings.sensor == second.readings.sensor:
         return None
@@ -305,7 +305,7 @@ def _strip(first: Placed, second: Placed, level_from_world: Float64) -> Ties | N
     return Ties("overlap, heads", _seen(first, own, a), _seen(second, other, b), weight)
 
 
-def _seen(one: Placed, cells: CellHeights, which: Int64) -> Seen:
+def _seen(one: LevelPoints, cells: CellHeights, which: Int64) -> Seen:
     """Return mean places of cells as the head would have seen them from the pose of one of their readings."""
     place = np.concatenate([cells.middle_m[which], cells.height_m[which, None]], axis=1)
     return one.seen(place, one.readings.pose[cells.reading[which]].astype(np.int64))

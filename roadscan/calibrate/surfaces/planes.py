@@ -139,7 +139,7 @@ class Pieces:
 
 
 @dataclass(frozen=True)
-class Placed:
+class LevelPoints:
     """Positions of readings with an estimate's mountings and corrections, in a level frame of the place.
 
     The level frame is the world turned so that z is up at the place.
@@ -202,7 +202,7 @@ def level_from_world(readings: Sequence[Readings]) -> Float64:
 
 def placed(
     one: Readings, estimate: Estimate, pieces: Pieces, traverses: Mapping[int, Traverse], level: Float64
-) -> Placed:
+) -> LevelPoints:
     """Compute the positions of readings with the mountings and the mean correction of an estimate.
 
     Parameters
@@ -214,7 +214,7 @@ def placed(
     number = pieces.numbers(one.epoch_gps_ns)
     shift, turn = _mean_correction(np.unique(number), estimate, traverses)
     corrected = one.world_from_body @ exponential(turn)
-    return Placed(
+    return LevelPoints(
         one,
         number,
         (one.position_world_m + shift) @ level.T,
@@ -354,7 +354,7 @@ def plane_ties(
     return _ties(found, first[near], second[near], rows[near], all_placed, turned, settings.partners)
 
 
-def _patches(one: Placed, drive: int, low: Float64, at: PlaneLevel, settings: PlaneSettings) -> _Patches:
+def _patches(one: LevelPoints, drive: int, low: Float64, at: PlaneLevel, settings: PlaneSettings) -> _Patches:
     """Return the plane patches of the readings of one sensor and drive."""
     whole = np.floor((one.place_m - low) / at.cell_m).astype(np.int64)
     if whole.size and whole.max() >= 1 << _KEY_BITS:
@@ -404,7 +404,7 @@ def _joined(parts: Sequence[_Patches]) -> _Patches:
 
 
 def _partners(
-    found: _Patches, at: PlaneLevel, settings: PlaneSettings, pieces: Pieces, all_placed: Sequence[Placed]
+    found: _Patches, at: PlaneLevel, settings: PlaneSettings, pieces: Pieces, all_placed: Sequence[LevelPoints]
 ) -> tuple[Int64, Int64]:
     """Return pairs of patches in one cell with similar normals, as rings through its patches in random order."""
     rng = np.random.default_rng(settings.seed)
@@ -429,7 +429,7 @@ def _ties(
     first: Int64,
     second: Int64,
     rows: Float64,
-    all_placed: Sequence[Placed],
+    all_placed: Sequence[LevelPoints],
     level_from_world: Float64,
     partners: int,
 ) -> list[Ties]:
@@ -451,5 +451,5 @@ def _ties(
     ]  # fmt: skip
 
 
-def _seen(found: _Patches, which: Int64, one: Placed) -> Seen:
+def _seen(found: _Patches, which: Int64, one: LevelPoints) -> Seen:
     return one.seen(found.centre_m[which], found.pose[which], found.position_m[which])

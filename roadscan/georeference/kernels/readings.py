@@ -144,7 +144,7 @@ class MirrorProfiles(NamedTuple):
     """From one reading of a profile to the next."""
 
 
-class Placed(NamedTuple):
+class Georeferenced(NamedTuple):
     """Map positions of readings, written by kernels."""
 
     east: npt.NDArray[np.float64]

@@ -33,7 +33,7 @@ from roadscan.georeference.kernels.readings import (
     NO_RETURN,
     OUTSIDE,
     RANGE,
-    Placed,
+    Georeferenced,
     Returns,
     box_of,
     chart_index,
@@ -184,8 +184,8 @@ def returns_of(readings, first, end):
 
 @inlined
 def placed_of(out, first, end):
-    """Return positions `first` to `end` − 1 of :class:`Placed`."""
-    return Placed(
+    """Return positions `first` to `end` − 1 of :class:`Georeferenced`."""
+    return Georeferenced(
         out.east[first:end], out.north[first:end], out.height[first:end], out.classes[first:end],
         out.intervals[first:end],
     )  # fmt: skip
@@ -198,7 +198,7 @@ def place_ranged(readings, georeference, out, fates):
     Parameters
     ----------
     readings : Returns in float64.
-    out : Placed; what is CLASS_KEPT on entry gets the class of its pose and height.
+    out : Georeferenced; what is CLASS_KEPT on entry gets the class of its pose and height.
     fates : (≥ FATES,) int64, in/out, counts of the readings left out, by fate.
     """
     nodes, motion = np.empty((4, SENSOR_AT)), np.empty((4, SENSOR_AT))
@@ -240,7 +240,7 @@ def place_returns(start, end, returns, georeference, out, fates):
     Parameters
     ----------
     returns : Returns in float32; georeference : Georeference.
-    out : Placed of at least end − start readings; the places of returns `start` and those behind it.
+    out : Georeferenced of at least end − start readings; the places of returns `start` and those behind it.
     fates : (≥ FATES,) int64, in/out, counts of the returns left out, by fate.
     """
     n = end - start
@@ -268,7 +268,7 @@ def place_mirror(start, end, profiles, georeference, out, fates):
     Parameters
     ----------
     profiles : MirrorProfiles.
-    out : Placed of at least (end − start) · m readings, profile by profile.
+    out : Georeferenced of at least (end − start) · m readings, profile by profile.
     Others as in :func:`place_returns`.
     """
     ranges, profile_epochs = profiles.ranges, profiles.epochs
@@ -300,7 +300,7 @@ def place_mirror(start, end, profiles, georeference, out, fates):
 @kernel
 def places(n):
     """Return arrays for the map positions of n readings."""
-    return Placed(np.empty(n), np.empty(n), np.empty(n), np.empty(n, np.uint8), np.empty(n, np.int32))
+    return Georeferenced(np.empty(n), np.empty(n), np.empty(n), np.empty(n, np.uint8), np.empty(n, np.int32))
 
 
 @bare_inner
@@ -309,8 +309,8 @@ def keep_points(first, n, made, placed, window, out):
 
     Parameters
     ----------
-    first : int64, number of the first reading; made : int64, points written before.
-    placed : Placed, of which the first n are the readings; window : Window; out : Points, rows of numbers of readings.
+    first : int64, number of the first reading; made : int64, points written before; window : Window.
+    placed : Georeferenced, of which the first n are the readings; out : Points, rows of numbers of readings.
 
     Returns
     -------

@@ -221,7 +221,7 @@ class GeoPackage(Home):
         for kind in self.kinds:
             schema = asset_schema(kind)
             own = rows.get(kind, asset_table(kind).empty_table())
-            table = own.select(asset_table(kind).names).cast(_told(kind))
+            table = own.select(asset_table(kind).names).cast(_file_schema(kind))
             self._layer(file, Sheet(schema.table, schema.title, table), schema.geometry_words, schema.meaning)
         for sheet in sheets:
             self._layer(file, sheet, "Point Z" if GEOMETRY in sheet.rows.column_names else None)
@@ -337,7 +337,7 @@ def programs_with(file: Path) -> list[str]:
     return sorted(found)
 
 
-def _told(kind: str) -> pa.Schema:
+def _file_schema(kind: str) -> pa.Schema:
     """Returns the kind's columns with the metadata that QGIS and others show: title, meaning."""
     fields = [
         pa.field(

@@ -359,14 +359,14 @@ def check_outcome(solution: Solution, gnss: GnssSolutions, vehicle: VehicleSenso
     if not (is_far and most > CONTRADICTED) and not min(positions, most) > 1.2 * CONTRADICTED:
         others = sum(share > _DOUBTFUL for share in doubted.values())
         if positions > 1.5 * _DOUBTFUL and others >= 2:
-            said = _told(positions, doubted)
+            said = _in_words(positions, doubted)
             return [f"measurements of several kinds disagree with the trajectory ({said} are outliers): {_CAUSE}"]
         return []
     size = np.linalg.norm(found.ned_m, axis=1)
     worst = int(np.argmax(size))
     record = int(found.records[worst])
     raise NavigationError(
-        f"the measurements contradict the trajectory: {_told(positions, doubted)} count as outliers, and "
+        f"the measurements contradict the trajectory: {_in_words(positions, doubted)} count as outliers, and "
         f"{far.mean():.0%} of the GNSS positions lie more than {FAR_SIGMAS:g} σ away, the farthest, record {record} "
         f"({iso_from_gps_ns(int(gnss.epochs_gps_ns[record]))}), by {size[worst]:.2f} m",
         expected=f"less than a third of each kind, and at most {FAR_SHARE:.0%} so far away",
@@ -434,6 +434,6 @@ def _doubted(solution: Solution) -> dict[str, float]:
     return {k: float((found.weight[found.kind == k] < 1.0).mean()) for k in kinds if (found.kind == k).sum() >= _LEAST}
 
 
-def _told(positions: float, others: dict[str, float]) -> str:
+def _in_words(positions: float, others: dict[str, float]) -> str:
     shares = {"gnss position": positions} | others
     return ", ".join(f"{share:.0%} of '{kind}'" for kind, share in shares.items())

@@ -138,7 +138,7 @@ def _features(layer: SiteLayer, numbers: Sequence[int]) -> dict[str, Any]:
     features = []
     for number in numbers:
         row = layer.rows[number]
-        told = {name: _told(name, row.get(name)) for name in names}
+        told = {name: _shown(name, row.get(name)) for name in names}
         feature = {"type": "Feature", "id": number, "geometry": geometry_of(layer.shapes_m[number]), "properties": told}
         if layer.evidence and layer.evidence[number]:
             feature["evidence"] = list(layer.evidence[number])
@@ -146,7 +146,7 @@ def _features(layer: SiteLayer, numbers: Sequence[int]) -> dict[str, Any]:
     return {"type": "FeatureCollection", "coordinates": "map_m", "layer": layer.name, "features": features}
 
 
-def _told(name: str, value: Any) -> Any:
+def _shown(name: str, value: Any) -> Any:
     """Return a value for the page: epochs as text, whatever their size."""
     return str(value) if name.endswith("_gps_ns") and value is not None else value
 

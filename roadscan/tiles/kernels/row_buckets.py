@@ -69,7 +69,7 @@ class Places(NamedTuple):
 def find_places(placed, n, active, places):
     """Write the cells of the first n georeferenced readings into `places`, in one loop without branches.
 
-    placed : Placed, of which what is not CLASS_KEPT has no place; active : ActiveTiles.
+    placed : Georeferenced, of which what is not CLASS_KEPT has no place; active : ActiveTiles.
     """
     east, north, _, classes, _ = placed
     corner, per_cell, edge = active.corner_quanta, 1.0 / active.cell_quanta, np.int64(active.ends.shape[1])
@@ -117,7 +117,7 @@ def put_in_buckets(placed, measured, first, end, places, active, buckets):
 
     Parameters
     ----------
-    placed : Placed; measured : Measured; places : from :func:`find_places`; active : ActiveTiles.
+    placed : Georeferenced; measured : Measured; places : from :func:`find_places`; active : ActiveTiles.
     buckets : Buckets, of which as many blocks as there are readings have to be free.
 
     Returns
@@ -185,7 +185,7 @@ def fill_buckets(placed, measured, places, active, buckets, fates):
 
     Parameters
     ----------
-    placed : Placed, of which the first are the readings; measured : Measured, of n readings; places : Places, work.
+    placed : Georeferenced, first of which are the readings; measured : Measured, of n readings; places : Places, work.
     active : ActiveTiles; buckets : Buckets, of which n blocks have to be free.
     fates : (≥ FATES,) int64, in/out: readings kept, and wanted ones outside the active tiles.
     """

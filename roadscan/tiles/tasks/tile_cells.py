@@ -150,10 +150,10 @@ class CountedTile:
 
 def count_tiles(task: TileTask, fates: ReadingCounts) -> Iterator[CountedTile]:
     """Yield the cells of all tiles of a task that needs no points, in the task's order."""
-    yield from _Stretch(task, fates).tiles(range(len(task.block.tiles)))
+    yield from _TileWorker(task, fates).tiles(range(len(task.block.tiles)))
 
 
-class _Stretch:
+class _TileWorker:
     """Computes one task."""
 
     def __init__(self, task: TileTask, fates: ReadingCounts) -> None:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from roadscan.core.grid import QUANTUM_M, TileId
 from roadscan.georeference.cloud import TilePoints, canonical_order, fill_of
-from roadscan.georeference.place import EXTRA_COLUMNS, Placed, Window, passes_of
+from roadscan.georeference.place import EXTRA_COLUMNS, Georeferenced, Window, passes_of
 from roadscan.georeference.plan.road import CentreLineBuffer, load_buffer
 from roadscan.georeference.reading_counts import ReadingCounts
 from roadscan.georeference.road_profiles import KEPT, LAS_CLASSES, OFF_CENTRE_LINE, WITHHELD_FLAG
@@ -108,7 +108,7 @@ class _Parts:
     """Collects the georeferenced readings of a block, with their pass and source."""
 
     def __init__(self) -> None:
-        self.placed: list[Placed] = []
+        self.placed: list[Georeferenced] = []
         self._passes: list[npt.NDArray[np.uint16]] = []
         self._sources: list[npt.NDArray[np.uint16]] = []
         self._numbers: dict[str, int] = {}
@@ -118,7 +118,7 @@ class _Parts:
     def add(
         self,
         source: ReadingSource,
-        placed: Placed,
+        placed: Georeferenced,
         passes: npt.NDArray[np.uint16],
         trajectory: Trajectory | None,
     ) -> None:
@@ -226,7 +226,7 @@ class _Joined:
         )
 
 
-def _joined_extra(parts: list[Placed], column: str) -> npt.NDArray[Any] | None:
+def _joined_extra(parts: list[Georeferenced], column: str) -> npt.NDArray[Any] | None:
     known = [p.extra[column] for p in parts if column in p.extra]
     if not known:
         return None
@@ -234,7 +234,7 @@ def _joined_extra(parts: list[Placed], column: str) -> npt.NDArray[Any] | None:
     return np.concatenate([p.extra.get(column, fill_of(column, p.epoch_gps_ns.size, kind)) for p in parts])
 
 
-def _lacks(parts: list[Placed], column: str) -> npt.NDArray[np.bool_]:
+def _lacks(parts: list[Georeferenced], column: str) -> npt.NDArray[np.bool_]:
     return np.concatenate([np.full(p.epoch_gps_ns.size, column not in p.extra) for p in parts])
 
 

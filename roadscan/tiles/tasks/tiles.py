@@ -19,7 +19,7 @@ from roadscan.georeference.reading_counts import ReadingCounts
 from roadscan.run.engine.compute import Compute, reason_of
 from roadscan.store.manifest import Manifest
 from roadscan.store.records import OutputRecord, Packed, Row, table_of
-from roadscan.store.store import told_if_full
+from roadscan.store.store import naming_full_disk
 from roadscan.tiles.cells import TileCells, TileEvidence, write_cells, write_overviews
 from roadscan.tiles.product import Tile, publish_file, write_product
 from roadscan.tiles.tasks.tile_plan import APART_FIGURE, OVERVIEWS, TILE, Block, TileTask
@@ -127,7 +127,7 @@ def compute_tiles(task: TileTask) -> TaskResult:
                 empty.append((computed.tile, key))
                 continue
             try:
-                with told_if_full(folder):
+                with naming_full_disk(folder):
                     records += _write_tile(task, key, computed.content, computed.evidence, folder)
             except Exception as error:  # noqa: BLE001  one tile's fault must not stop the others
                 failures.append((str(computed.tile), reason_of(error)))

@@ -89,7 +89,7 @@ def test_a_place_that_does_not_answer_is_no_damage(
 
     for name in ("cat_file", "open"):
         monkeypatch.setattr(store.fs, name, silent)
-    monkeypatch.setattr("roadscan.store.readings.group_reader.opened", silent)
+    monkeypatch.setattr("roadscan.store.readings.row_groups.opened", silent)
     with pytest.raises((StoreError, OSError)) as told:
         READERS[reader](store)
     assert not isinstance(told.value, DamagedError) and may_pass(told.value) == "a place does not answer"

@@ -138,7 +138,7 @@ def reference_point(shape: shapely.Geometry) -> tuple[float, float, float]:
     """Returns easting, northing and height of the reference point of a shape.
 
     That is a point itself, the middle of a line, a point within an area (of an upright one the mean of its outline).
-    The height is that of the line there, or the mean of an area's outline. Corners within straight sides change nothing.
+    The height is that of the line there, or the mean of an area's outline. Corners within a side change nothing.
     """
     if shape.geom_type == "Point":
         return float(shape.x), float(shape.y), float(shape.z)

@@ -38,6 +38,9 @@ LINES: Final = {"kerb": 0.05, "guardrail": 0.15, "facade": 0.3, "fence": 0.15, "
 AREAS: Final = ("sidewalk", "landscape_area")
 NONE_THERE: Final = ("wall", "barrier", "attenuator", "median")
 """Kinds that the streets lack, but for boxes."""
+_MANHOLE_M: Final = 1.0
+"""A round patch that is no wider is a manhole's cover."""
+_FURNITURE: Final = ("cabinet", "bin", "litter_bin", "bench", "hydrant", "bus_shelter")
 
 
 class Judged(NamedTuple):
@@ -108,6 +111,22 @@ def true_areas(street: Street) -> dict[str, shapely.Geometry]:
         for s in [p.station_m + n * p.every_m for n in range(p.count if p.every_m > 0.0 else 1)]
     ]
     return {"sidewalk": shapely.union_all(walks), "landscape_area": shapely.union_all(beds)}
+
+
+def true_spots(street: Street) -> dict[str, shapely.Geometry]:
+    """Where covers and drains lie, furniture stands and wires hang, by kind."""
+    side, (east, north) = street.scene.roadside, street.things[["easting_m", "northing_m"]].to_numpy().T
+    round_ones = [p for p in street.scene.road.patches if p.shape == "circle" and p.length_m <= _MANHOLE_M]
+    lids = [street.line(p.offset_m, p.station_m - 0.1, p.station_m + 0.1) for p in round_ones]
+    wires = [[street.surface.place(np.array([at]), np.array([to]))[:2] for at, to in
+              ((w.station_m, w.offset_m), (w.to_station_m, w.to_offset_m))] for w in side.wires]  # fmt: skip
+    kinds = {"cover": ("cover", "drain"), "street_furniture": _FURNITURE}
+    found = {
+        kind: shapely.union_all(shapely.points(east, north)[street.things.kind.isin(names).to_numpy()])
+        for kind, names in kinds.items()
+    }
+    found["cover"] = shapely.union_all([found["cover"], *lids])
+    return found | {"wire": shapely.union_all([shapely.LineString(np.array(w)[:, :, 0]) for w in wires])}
 
 
 def boxes(street: Street) -> shapely.Geometry:
@@ -352,6 +371,10 @@ def line_figures(street: Street) -> Iterator[Figure]:
         table = street.found(kind)
         false = sum(_share_near(g, solid, 0.3) < 0.5 for g in table.geometry)
         yield Figure(f"{kind}: false ones", float(false), "")
+    for kind, places in true_spots(street).items():
+        shapes = shapely.force_2d(street.found(kind).geometry.to_numpy())
+        false = sum(_share_of(_samples(g) if g.length else np.array([g]), places, NEAR_M) < 0.5 for g in shapes)
+        yield Figure(f"{kind}: false ones of {len(shapes)}", float(false), "")
 
 
 def _hit(street: Street, places_m: Float64) -> npt.NDArray[np.bool_]:

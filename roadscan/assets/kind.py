@@ -137,21 +137,21 @@ _FIELDS: Final = (
 def reference_point(shape: shapely.Geometry) -> tuple[float, float, float]:
     """Returns easting, northing and height of the reference point of a shape.
 
-    That is a point itself, the middle of a line, a point within an area (of an upright one the mean of its corners).
-    The height is that of the line there, or the mean of an area's corners.
+    That is a point itself, the middle of a line, a point within an area (of an upright one the mean of its outline).
+    The height is that of the line there, or the mean of an area's outline. Corners within a side change nothing.
     """
     if shape.geom_type == "Point":
         return float(shape.x), float(shape.y), float(shape.z)
     if shape.geom_type == "LineString":
         middle = shapely.line_interpolate_point(shape, 0.5, normalized=True)
         return float(middle.x), float(middle.y), float(middle.z)
-    corners = shapely.get_coordinates(shape.exterior, include_z=True)[:-1]
-    height = float(np.mean(corners[:, 2]))
+    corners = shapely.get_coordinates(shape.exterior, include_z=True)
+    sides_m = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    east, north, height = (sides_m @ (corners[1:] + corners[:-1]) / (2.0 * sides_m.sum())).tolist()
     flat = shapely.force_2d(shape)
-    if flat.area <= 1e-6 or not flat.is_valid:
-        return float(np.mean(corners[:, 0])), float(np.mean(corners[:, 1])), height
-    within = shapely.point_on_surface(flat)
-    return float(within.x), float(within.y), height
+    if flat.area > 1e-6 and flat.is_valid:
+        east, north = shapely.get_coordinates(shapely.point_on_surface(flat))[0].tolist()
+    return east, north, height
 
 
 def object_names(kind: str, places_m: npt.NDArray[np.float64]) -> list[str]:

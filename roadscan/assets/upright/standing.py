@@ -80,13 +80,13 @@ def about(scene: Scene, shaft: Shaft) -> About:
     return About(rows[kept], right[kept], ahead[kept], away[kept], above[kept])
 
 
-def crown_share(near: About, shaft: Shaft) -> float:
+def crown_share(scene: Scene, near: About, shaft: Shaft) -> float:
     """Returns the share of the eight directions with returns within 1.5 m, mean of the three fullest levels of 0.4 m.
 
-    Crowns fill all directions; plates, arms and façades one to three of them. What begins far above the shaft's top,
-    and above all that hangs on it, is no crown of it.
+    Crowns fill all directions; plates and arms one to three of them. Fronts beside a post fill half, and are left out.
+    What begins far above the shaft's top, and above all that hangs on it, is no crown of it.
     """
-    close = near.away_m < 1.5
+    close = (near.away_m < _CROWN_M) & (scene.classes[near.rows] != classes.BUILDING)
     heights = np.sort(near.above_m[close])
     gaps = np.flatnonzero(np.diff(np.maximum(heights, shaft.top_above_m), prepend=shaft.top_above_m) > _CROWN_GAP_M)
     if gaps.size:
@@ -410,7 +410,7 @@ def uprights_of(scene: Scene) -> list[Upright]:
     probable = _apart([(s, p) for s, p in zip(shafts, stated, strict=True) if p >= LEAST])
     near = [about(scene, shaft) for shaft, _ in probable]
     crowns = [
-        0.0 if is_head_alone(scene, a) else tree_probability(shaft, crown_share(a, shaft))
+        0.0 if is_head_alone(scene, a) else tree_probability(shaft, crown_share(scene, a, shaft))
         for (shaft, _), a in zip(probable, near, strict=True)
     ]
     trunks = np.array([[s.axis.x_m, s.axis.y_m] for (s, _), c in zip(probable, crowns, strict=True) if c >= 0.5])

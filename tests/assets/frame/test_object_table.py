@@ -22,6 +22,9 @@ def found(shape: shapely.Geometry, **attributes: object) -> AssetObject:
         (shapely.LineString([(0, 0, 1), (6, 0, 1), (6, 2, 3)]), (4.0, 0.0, 1.0)),
         (shapely.Polygon([(0, 0, 2), (4, 0, 2), (4, 4, 4), (0, 4, 4)]), (2.0, 2.0, 3.0)),
         (shapely.Polygon([(0, 0, 0), (6, 0, 0), (6, 0, 9), (0, 0, 9)]), (3.0, 0.0, 4.5)),
+        # a cut of the map left corners within straight sides
+        (shapely.Polygon([(0, 0, 0), (1, 0, 0), (6, 0, 0), (6, 0, 9), (1, 0, 9), (0, 0, 9)]), (3.0, 0.0, 4.5)),
+        (shapely.Polygon([(0, 0, 2), (1, 0, 2), (4, 0, 2), (4, 4, 4), (0, 4, 4)]), (2.0, 2.0, 3.0)),
     ],
 )
 def test_the_reference_point_is_on_the_shape(shape: shapely.Geometry, place: tuple[float, float, float]) -> None:

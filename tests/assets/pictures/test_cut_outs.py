@@ -120,6 +120,11 @@ def test_a_plate_that_is_too_small_keeps_the_shape_of_the_returns():
     assert shape_of([], "square", 0.6, 0.6)[0] == "square"
 
 
+def test_a_plate_that_can_only_be_a_rectangle_is_no_certain_one_without_a_picture_of_it():
+    small = plate("rectangle", "blue", ratio=0.6, size_px=8.0)
+    assert shape_of([small], "rectangle", 0.9, 0.54) == ("rectangle", 0.7)
+
+
 @pytest.mark.parametrize("light", [(1.0, 1.0, 1.0), (1.0, 0.85, 0.6), (0.7, 0.85, 1.0), (0.3, 0.33, 0.4)])
 @pytest.mark.parametrize(("name", "paint"), [("white", (0.72, 0.72, 0.70)), ("yellow", (0.70, 0.50, 0.10))])
 def test_white_and_yellow_paint_are_told_apart_in_any_light(name: str, paint: tuple[float, ...], light: tuple):

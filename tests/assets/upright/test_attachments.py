@@ -1,11 +1,15 @@
-"""Arms of few returns."""
+"""Arms of few returns, and what is no crown."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from benchmarks.judged_scenes import simulated
+from benchmarks.labelled_returns import labelled_returns
 from roadscan.assets.upright.standing import _reach
+from roadscan.simulate import Scene
+from tests.assets.upright.scene import objects_of
 
 
 @pytest.mark.parametrize("count", [10, 12])
@@ -15,3 +19,26 @@ def test_the_end_of_an_arm_has_a_height_where_its_last_return_lies_apart(count: 
     reach_m, height_m = _reach(along, np.where(along == 1.74, 5.2, 5.0))
     assert 1.55 < reach_m < 1.64
     assert height_m == 5.2
+
+
+def test_a_post_before_a_front_is_no_tree_where_the_sun_makes_false_returns() -> None:
+    street = Scene.model_validate(
+        {
+            "seed": 11, "length_m": 24.0, "passes": [{"lane": 2}], "profilers": {"on": False},
+            "road": {"lanes": 2, "verge_width_m": 12.0, "verge_slope": 0.02, "lead_m": 70.0},
+            "roadside": {
+                "facades": [{"offset_m": -8.5, "start_m": -20.0, "end_m": 50.0, "height_m": 8.0}],
+                "poles": [{"station_m": 3.0, "offset_m": -8.0, "every_m": 6.0, "count": 4, "height_m": 3.5,
+                           "diameter_m": 0.1}],
+                "trees": [{"station_m": 15.0, "offset_m": 8.0, "height_m": 8.0, "trunk_m": 0.3}],
+            },
+            "vehicle": {"speed_m_per_s": 12.0, "standstill_s": 0.0},
+            "lidar": {"range_max_m": 30.0, "false_returns": 0.004},
+            "noise": {"lidar_range_m": 0.015, "intensity": 5.0, "dropout": 0.002},
+        }
+    )  # fmt: skip
+    seen = labelled_returns(street)
+    scene = simulated(street, "hard", 1.0, seen).scene
+    for kind, offset_m in (("pole", -8.0), ("tree", 8.0)):
+        (found,) = (np.array([one.geometry.x, one.geometry.y]) for one in objects_of(scene, kind))
+        assert abs(float(seen.surface.station_offset_m(*found[:, None])[1][0]) - offset_m) < 0.1

@@ -180,6 +180,8 @@ def shape_of(cut_outs: Sequence[CutOut], shape: str, width_m: float, height_m: f
     shape : as the returns have it.
     width_m, height_m : of the bounding box.
     """
+    if not any(map(_is_large, cut_outs)):
+        return shape, _FROM_RETURNS
     own = "rectangle" if shape == "square" else shape
     names = [n for n in SHAPES if _fits(n, width_m, height_m)]
     if own not in names:
@@ -195,11 +197,8 @@ def shape_of(cut_outs: Sequence[CutOut], shape: str, width_m: float, height_m: f
         key = name.split()[0]
         joined[key] = joined.get(key, 0.0) + float(np.exp(value - top))
     best = min(joined, key=lambda n: (-joined[n], n))
-    unknown = _UNKNOWN * joined[best] if any(map(_is_large, cut_outs)) else 0.0
-    probability = joined[best] / (sum(joined.values()) + unknown)
-    if best == "rectangle" and shape == "square":
-        best = "square"
-    return best, probability
+    name = shape if (best, shape) == ("rectangle", "square") else best
+    return name, joined[best] / (sum(joined.values()) + _UNKNOWN * joined[best])
 
 
 def plate_odds(cut_outs: Sequence[CutOut], shape: str) -> float:

@@ -151,15 +151,26 @@ def straight_lines(groups: Groups, which: Bool) -> Bool:
     is_long = groups.boxes[:, 2:].max(axis=1, initial=0) >= _LINE_CELLS / math.sqrt(2.0)
     for k in np.flatnonzero(which & is_long).tolist():
         part = _part(groups.boxes[k], 0)
-        row, column = np.nonzero(groups.label[part] == groups.number[k])
-        free, x, y = np.ones(row.size, np.bool_), column.astype(np.float64), row.astype(np.float64)
+        inside = groups.label[part] == groups.number[k]
+        row, column = np.nonzero(inside)
+        free, x, y = at_the_rim(inside)[row, column], column.astype(np.float64), row.astype(np.float64)
         for _ in range(_MOST_LINES if row.size <= _MOST_CELLS else 0):
             line = np.zeros(row.size, np.bool_)
             if columns.straight_run(x, y, free, _LINE_ANGLES, _LINE_GAP, line) < _LINE_CELLS:
                 break
             free &= ~line
-        out[part][row[~free], column[~free]] = True
+            out[part][row[line], column[line]] = True
     return out
+
+
+def at_the_rim(inside: Bool) -> Bool:
+    """Returns the cells of a group with room beside them: no line runs across the roofs of cars that touch each other.
+
+    inside : (rows, columns), and so is what is returned. A hole of one cell in a body is none.
+    """
+    around, rim = np.ones((3, 3), np.uint8), np.pad(inside, 2)
+    body = cv2.morphologyEx(rim.view(np.uint8), cv2.MORPH_CLOSE, around)
+    return np.asarray((rim & (cv2.erode(body, around) == 0))[2:-2, 2:-2])
 
 
 def _upper_part(levels: npt.NDArray[np.uint32], free: Bool, body: Bool) -> tuple[Bool, Int32]:

@@ -48,7 +48,7 @@ def test_a_cabin_behind_a_bonnet_belongs_to_its_vehicle_and_a_plate_beside_it_do
 
 def test_a_fence_that_touches_a_car_is_a_line_and_no_side_of_a_car_is() -> None:
     """Cells of 0.2 m: a fence of 9 m, which the mirror of a car touches, of which three sides are seen; a van of 4.4 m
-    by 2 m touches the car.
+    by 2 m touches the car. Cars whose bodies are seen all over touch each other.
     """
     fence, vehicles = np.zeros((40, 80), np.bool_), np.zeros((40, 80), np.bool_)
     fence[14, 5:50] = True
@@ -57,6 +57,14 @@ def test_a_fence_that_touches_a_car_is_a_line_and_no_side_of_a_car_is() -> None:
     label, box = (fence | vehicles).astype(np.int32), np.array([[5, 4, 49, 31]], np.int32)
     lines = straight_lines(Groups(label, np.array([1]), box, np.zeros(1, np.int32), {}), np.ones(1, np.bool_))
     assert lines[fence].all() and np.count_nonzero(lines & vehicles & ~fence) <= 3  # what touches it
+    touching = np.zeros((40, 80), np.bool_)
+    for k in range(
+        4
+    ):  # cars of 3.2 m by 1.8 m side by side, each 1.2 m farther ahead; holes, where roofs were not seen
+        touching[2 + 9 * k : 11 + 9 * k, 20 + 6 * k : 36 + 6 * k] = True
+        touching[4 + 9 * k : 9 + 9 * k : 2, 24 + 6 * k : 32 + 6 * k : 3] = False
+    row = Groups(touching.astype(np.int32), np.array([1]), np.array([[20, 2, 34, 36]]), np.zeros(1, np.int32), {})
+    assert not straight_lines(row, np.ones(1, np.bool_)).any()
     vehicles[14, 31] = False
     alone = Groups(vehicles.astype(np.int32), np.array([1]), box, np.zeros(1, np.int32), {})
     assert not straight_lines(alone, np.ones(1, np.bool_)).any()

@@ -15,7 +15,7 @@ export PYTHONDONTWRITEBYTECODE :=
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test check lint types contracts house docs docs-check pytest nightly test-library fuzz bench viewer format venv install install-dev constraints clean
+.PHONY: help demo test slow check lint types contracts house docs docs-check pytest nightly test-library fuzz bench viewer format venv install install-dev constraints clean
 
 help:  ## Show the targets.
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
@@ -25,7 +25,7 @@ demo: $(VENV)/.installed  ## Simulate a small survey, process it, compare with i
 	$(BIN)/roadscan demo --out demo
 
 # Types take one processor for as long as a tenth of the tests: the tests begin beside them, when the other checks are through.
-test: $(VENV)/.installed-dev  ## All that CI runs: check, and the tests.
+test: $(VENV)/.installed-dev  ## What every change passes within ten minutes: check, and the tests that are not slow.
 	@$(MAKE) --no-print-directory --jobs 2 check pytest
 
 check: lint types contracts house docs-check  ## Lint, types, import contracts, documentation.
@@ -52,7 +52,10 @@ docs-check: $(VENV)/.installed-dev  ## Fail where a generated page is out of dat
 
 # The last lines of the output are pytest's summary.
 pytest: $(VENV)/.installed-dev  ## Tests only; PYTEST_ARGS="tests/core -n0" narrows them.
-	$(BIN)/python -m pytest $(or $(PYTEST_ARGS),-q -n 2 --dist worksteal)
+	$(BIN)/python -m pytest $(or $(PYTEST_ARGS),-q -n 2 --dist worksteal -m "not slow and not nightly" --durations=10)
+
+slow: $(VENV)/.installed-dev  ## The slow tests, most of them whole surveys from log to product: CI runs them after `make test`.
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m "slow and not nightly" $(PYTEST_ARGS)
 
 nightly: $(VENV)/.installed-dev  ## What takes too long for every change: fuzz, power cuts, servers, a second user, benchmarks, no AVX-512.
 	$(BIN)/python -m pytest -q -n 2 -m nightly --timeout=1800 $(PYTEST_ARGS)

@@ -57,6 +57,7 @@ PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 # --- pages --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_generated_pages_are_current() -> None:
     assert generate.stale(generate.pages()) == [], "run `make docs` and commit the result"
 
@@ -209,6 +210,7 @@ def test_readme_lists_every_format_and_product() -> None:
     assert products().keys() == set(re.findall(r"`(\w+)`", tables["out"]))
 
 
+@pytest.mark.slow
 def test_readme_questions_to_the_demo_have_answers(
     finished: Simulated,
     tmp_path: Path,
@@ -243,6 +245,7 @@ def test_the_complete_survey_and_rig_files_load() -> None:
         product_named(name).options.parse(options)
 
 
+@pytest.mark.slow
 def test_a_survey_from_arrays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     runpy.run_path(str(ROOT / "docs" / "examples" / "survey_from_arrays.py"))
@@ -295,6 +298,7 @@ def placed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_the_examples_pass_the_checks_in_their_places(placed: Path) -> None:
     """Style, the order of imports, constants; a folder with code is a package, and one that the contracts know."""
     run = functools.partial(subprocess.run, cwd=placed, capture_output=True, text=True, check=False)
@@ -512,12 +516,14 @@ def test_the_contributed_kind_of_assets(plugin: Path) -> None:
     assert "overhang" not in generate.asset_list("")
 
 
+@pytest.mark.slow
 def test_contributed_formats_stay_off_the_pages(plugin: Path) -> None:
     assert "boxlog" in log_formats()
     assert "boxlog" not in generate.formats("")
     assert "flatness" not in generate.product_list("")
 
 
+@pytest.mark.slow
 def test_the_contributed_stage(plugin: Path, finished: Simulated, tmp_path: Path) -> None:
     survey = finished.copy_with_store_to(tmp_path / "survey").survey_file
     ends = ["levels", "pictures", "surfaces", "products", "condition", "assets", "colours"]
@@ -544,6 +550,7 @@ def test_the_contributed_stage(plugin: Path, finished: Simulated, tmp_path: Path
     assert due() == 1
 
 
+@pytest.mark.slow
 def test_the_contributed_settings(plugin: Path, finished: Simulated, tmp_path: Path) -> None:
     """A section of the survey file of another package: checked, used, and part of the keys."""
     survey = finished.copy_with_store_to(tmp_path / "survey").survey_file
@@ -558,6 +565,7 @@ def test_the_contributed_settings(plugin: Path, finished: Simulated, tmp_path: P
     assert survey_status(Session.open(survey)).of("levels").stale == 0
 
 
+@pytest.mark.slow
 def test_the_contributed_section_and_layer(plugin: Path, finished: Simulated, tmp_path: Path) -> None:
     survey = finished.copy_with_store_to(tmp_path / "survey").survey_file
     assert CliRunner().invoke(app, ["levels", str(survey), "--workers", "0"]).exit_code == 0

@@ -47,6 +47,7 @@ def executes(tree: ast.AST) -> list[str]:
     return found
 
 
+@pytest.mark.slow
 def test_no_source_unpickles_or_executes_data() -> None:
     assert len(SOURCES) > 300
     found = {str(file): executes(ast.parse(file.read_text(encoding="utf-8"))) for file in SOURCES}

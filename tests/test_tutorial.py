@@ -60,6 +60,7 @@ def shape(line: str) -> str:
     return re.sub(r"[ ─]+", " ", re.sub(r"\d[\d,.]*", "#", line)).strip()
 
 
+@pytest.mark.slow
 def test_the_commands_run_and_print_what_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "docs").symlink_to(ROOT / "docs")
     monkeypatch.chdir(tmp_path)

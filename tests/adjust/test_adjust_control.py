@@ -129,6 +129,7 @@ def test_right_control_is_not_doubted(one_drive: Simulated, tmp_path: Path) -> N
     assert [line for line in found.lines if "solution settled after" in line]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong_m", [0.05, -0.1, 1.0])
 def test_a_wrong_height_that_one_drive_alone_saw_is_named_and_spoils_no_figure(
     one_drive: Simulated, tmp_path: Path, wrong_m: float
@@ -149,6 +150,7 @@ def left_out(found: Outcome) -> dict[str, Any]:
     return found.rows(f"SELECT count, rmse_m FROM absolute_accuracy {where}")[0]
 
 
+@pytest.mark.slow
 @pytest.mark.witness("control_datum")
 @pytest.mark.parametrize("offset_m", [-0.1, 0.3])
 def test_control_off_as_a_whole_is_named_and_the_error_stays_within_sigma(
@@ -170,6 +172,7 @@ def test_control_off_as_a_whole_is_named_and_the_error_stays_within_sigma(
     assert [one.left_out for one in followed.of("control_datum")] == [0]
 
 
+@pytest.mark.slow
 def test_an_offset_that_poses_cannot_tell_is_within_the_sigma_of_the_datum(
     one_drive: Simulated, tmp_path: Path
 ) -> None:
@@ -198,6 +201,7 @@ def test_an_offset_of_the_control_is_within_sigma_or_named(
                 assert np.abs(found.off_m()).max() < 0.045
 
 
+@pytest.mark.slow
 def test_the_order_of_runs_in_the_survey_file_changes_no_bit(three_drives: Simulated, tmp_path: Path) -> None:
     """Corrections, tables and pictures of two orders of the same runs."""
     made = []
@@ -215,6 +219,7 @@ def test_the_order_of_runs_in_the_survey_file_changes_no_bit(three_drives: Simul
     assert [path for path in made[0] if made[0][path] != made[1][path]] == []
 
 
+@pytest.mark.slow
 @pytest.mark.witness("run_not_held")
 def test_a_run_that_no_control_and_no_tie_holds_is_named(tmp_path: Path) -> None:
     """Two drives in one lane and one in a lane that their strips do not reach; control lies in the one lane."""
@@ -224,6 +229,7 @@ def test_a_run_that_no_control_and_no_tie_holds_is_named(tmp_path: Path) -> None
     assert [one.subject for one in found.of("run_not_held")] == ["run 'run-3'"]
 
 
+@pytest.mark.slow
 @pytest.mark.witness("helmert_turn")
 def test_a_turn_that_control_along_one_line_leaves_open_is_told_with_sigma(
     three_drives: Simulated, tmp_path: Path
@@ -235,6 +241,7 @@ def test_a_turn_that_control_along_one_line_leaves_open_is_told_with_sigma(
     assert found.sigma_m() > np.hypot(0.015, 0.015)
 
 
+@pytest.mark.slow
 @pytest.mark.witness("stated_sigma")
 def test_a_sigma_that_is_stated_ten_times_too_small_is_found(three_drives: Simulated, tmp_path: Path) -> None:
     priors = {"source": "stated", "sigma_down_m": 0.0015}
@@ -246,6 +253,7 @@ def test_a_sigma_that_is_stated_ten_times_too_small_is_found(three_drives: Simul
     assert len(found.findings) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.witness("solution_settled")
 def test_a_solution_that_did_not_settle_is_told(three_drives: Simulated, tmp_path: Path) -> None:
     one_round = {"max_rounds": 1, "estimate_variance_components": True}

@@ -380,6 +380,7 @@ def test_false_matches_do_not_bend_a_road() -> None:
     assert rms[1] < 1.1 * rms[0]
 
 
+@pytest.mark.slow
 def test_stated_sigmas_are_honest() -> None:
     """Normalised squared errors at stations 10 s apart, 12 draws, within their 99 % bounds."""
     road, settings = replace(ROAD, length_m=1500.0), AdjustmentSettings(knot_spacing_s=0.25)
@@ -494,6 +495,7 @@ def test_wrong_statistics_are_found_by_variance_components() -> None:
     assert factors["shift_tie"] == pytest.approx(1.0, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_component_stated_too_small_counts_beside_one_stated_far_smaller() -> None:
     """σ of heights stated fifteen times too small, and of places to the east three times: a factor of 225, and of 9."""
     road = Road(2500.0, 3, 5.0, 50.0, lane_m=3.5)
@@ -547,6 +549,7 @@ def test_a_survey_of_control_whose_sigma_is_ten_times_too_small_is_not_taken_for
     assert np.sqrt(np.mean(off**2)) < 2.0 * np.mean([s[:, 2].mean() for s in found.sigma])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("runs", [1, 3])
 def test_one_wrong_height_is_named_and_no_right_one_beyond_the_stated_chance(runs: int) -> None:
     """Five points of 600 m, one of them wrong, in 14 draws, and 60 draws of right control."""
@@ -577,6 +580,7 @@ def test_one_wrong_height_is_named_and_no_right_one_beyond_the_stated_chance(run
     assert right <= 5
 
 
+@pytest.mark.slow
 def test_three_thousand_points_are_judged_by_their_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
     """The wrong ones are named, no others, and no covariance is of more than 200 points."""
     road = Road(30_000.0, 1, 20.0, 10.0, speed_m_s=25.0)

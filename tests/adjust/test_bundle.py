@@ -211,6 +211,7 @@ def test_rows_are_the_derivatives_of_residuals() -> None:
         np.testing.assert_allclose(change, by[:, k], atol=6e-3 * np.abs(by[:, k]).max() + 1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("false", [0.0, 0.3])
 def test_poses_boresight_and_lens_come_back(false: float) -> None:
     drive = simulated_drive(3, false, np.array([1.5]))
@@ -228,6 +229,7 @@ def test_poses_boresight_and_lens_come_back(false: float) -> None:
     assert abs(state.cameras[0][0] - 1.5) < 3.0 * found.cameras.sigma[0, 0]
 
 
+@pytest.mark.slow
 def test_stated_sigma_holds_and_residuals_are_those_of_the_noise() -> None:
     errors = []
     for seed in range(4):
@@ -244,6 +246,7 @@ def test_stated_sigma_holds_and_residuals_are_those_of_the_noise() -> None:
     assert 0.4 < np.sqrt(np.mean(np.concatenate(errors) ** 2)) < 1.5
 
 
+@pytest.mark.slow
 def test_attitude_and_boresight_are_known_together_far_better_than_each() -> None:
     """The camera's attitude by the joint covariance: errors over σ; and its σ over those of independent errors."""
     normalised, shares = [], []
@@ -271,6 +274,7 @@ def test_attitude_and_boresight_are_known_together_far_better_than_each() -> Non
     assert np.median(np.concatenate(shares)) < 0.2
 
 
+@pytest.mark.slow
 def test_the_order_of_measurements_changes_no_bit() -> None:
     drive = simulated_drive(5)
     order = np.random.default_rng(0).permutation(drive.evidence.measured.point.size)
@@ -279,18 +283,21 @@ def test_the_order_of_measurements_changes_no_bit() -> None:
     np.testing.assert_allclose(one.values[0], two.values[0], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_right_camera_is_not_told_to_be_wrong() -> None:
     for seed in range(3):
         free = _free(simulated_drive(seed))
         assert [free.off(0, name)[0] for name in ("focal_x_px", "focal_y_px", "k1", "clock_s")] == [0.0] * 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.1, 0.03, -0.03])
 def test_a_focal_length_that_is_wrong_is_found(share: float) -> None:
     error, sigma = _free(simulated_drive(3, lens_error=np.array([share * 784.0]))).off(0, "focal_x_px")
     assert abs(error - share * 784.0) < 4.0 * sigma and sigma < 0.01 * 784.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late_s", [0.1, -0.1])
 def test_stamps_of_the_pictures_beside_are_found(late_s: float) -> None:
     error, sigma = _free(simulated_drive(3, late_s=late_s)).off(0, "clock_s")

@@ -47,6 +47,7 @@ def clock_row(sensor: str, offset_s: float, drift_ppm: float, reference_gps_ns: 
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_an_estimated_clock_puts_readings_where_a_right_one_does(right: Simulated, tmp_path: Path) -> None:
     late = {"offset_s": 0.5, "drift_ppm": 40.0}
     scene = small_scene(**SHORT).changed(profilers={"clock": late})

@@ -148,6 +148,7 @@ def test_rows_are_the_derivatives_of_distances(drive: Drive) -> None:
         np.testing.assert_allclose((other - one) / (2 * step), by[:, k], atol=6e-3 * np.abs(by[:, k]).max() + 1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clutter", [0.0, 0.2])
 def test_the_lidar_tells_the_boresight_of_the_camera(drive: Drive, clutter: float) -> None:
     without, _ = _boresight_off_deg(drive, _approached(drive, ()))

@@ -97,6 +97,7 @@ def found() -> EdgeBoresight:
     return boresight_of(_sighted(), _scores(range(8)), SHARED_RAD)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [100, 200])
 def test_the_boresight_comes_back_within_its_sigma(first: int) -> None:
     own = boresight_of(_sighted(), _scores(range(first, first + 8)), SHARED_RAD)
@@ -107,6 +108,7 @@ def test_the_boresight_comes_back_within_its_sigma(first: int) -> None:
     assert (np.degrees(own.sigma) < 0.15).all()
 
 
+@pytest.mark.slow
 def test_edges_of_another_scene_say_nothing() -> None:
     own = boresight_of(_sighted(), _scores(range(8), pictures_of=50), SHARED_RAD)
     assert own.why_not
@@ -117,6 +119,7 @@ def test_few_pictures_say_nothing() -> None:
     assert "too few" in boresight_of(_sighted(), _scores(range(3)), SHARED_RAD).why_not
 
 
+@pytest.mark.slow
 def test_a_lever_arm_that_is_off_turns_the_boresight_as_told(found: EdgeBoresight) -> None:
     shift = np.array([0.0, 0.08, -0.06])
     moved = boresight_of(_sighted(), _scores(range(8), CAMERA_M - shift), SHARED_RAD)
@@ -125,6 +128,7 @@ def test_a_lever_arm_that_is_off_turns_the_boresight_as_told(found: EdgeBoresigh
     assert np.abs(np.degrees(moved.turn - found.turn - told)).max() < 0.1
 
 
+@pytest.mark.slow
 def test_the_adjustment_takes_what_edges_say(found: EdgeBoresight) -> None:
     mountings = (
         MountingPrior("camera", np.array([*[0.001] * 3, *np.radians([0.5] * 3), 0.0])),
@@ -139,6 +143,7 @@ def test_the_adjustment_takes_what_edges_say(found: EdgeBoresight) -> None:
     assert sigma == pytest.approx(found.sigma, rel=0.1)
 
 
+@pytest.mark.slow
 def test_an_assumed_sigma_does_not_hold_a_boresight_back(found: EdgeBoresight) -> None:
     stated = (MountingPrior("camera", np.array([*[0.02] * 3, *np.radians([0.5, 0.0, 2.0]), 0.0])),)
     assert widened(stated, [found]) == stated
@@ -149,6 +154,7 @@ def test_an_assumed_sigma_does_not_hold_a_boresight_back(found: EdgeBoresight) -
     assert (wider[:3] == 0.02).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("drift", [0.0, 0.012])
 def test_tie_points_that_bend_the_lever_arm_with_the_boresight_count_less(drift: float) -> None:
     """Recorded places drift sideways by a share of the way: tie points take that for a heading of the camera."""
@@ -179,6 +185,7 @@ def test_tie_points_that_bend_the_lever_arm_with_the_boresight_count_less(drift:
     assert (np.abs(off) < 2.5 * known).all() and np.abs(off).max() < 0.15
 
 
+@pytest.mark.slow
 @pytest.mark.witness("picture_edges")
 def test_a_boresight_that_edges_contradict_is_told(found: EdgeBoresight) -> None:
     assert boresight_findings([found]) == []

@@ -52,6 +52,7 @@ def searched(samples):
     return [(find_target(s.readings, s.expected, SETTINGS), s) for s in samples]
 
 
+@pytest.mark.slow
 def test_new_targets_are_all_found_to_the_bar_and_their_sigma_is_honest(road):
     """Each of 10 within 1.5 mm; normalised squared errors, with the paint's own σ, below their upper 99.5 %."""
     found = searched(road.sample(rng(seed)) for seed in range(10))
@@ -64,6 +65,7 @@ def test_new_targets_are_all_found_to_the_bar_and_their_sigma_is_honest(road):
     assert all(abs(f.diameter_m - 0.30) < 0.004 and f.score > 0.9 for f, _ in found)
 
 
+@pytest.mark.slow
 def test_worn_targets_are_found_and_their_sigma_is_honest(road):
     """Half of the contrast, 30 % gone in patches."""
     found = [(f, s) for f, s in searched(road.sample(rng(seed), wear=WORN) for seed in range(8)) if f.found]
@@ -124,6 +126,7 @@ def test_the_azimuth_is_that_of_a_white_quadrant():
         assert white[round(row), round(column)] == expected
 
 
+@pytest.mark.slow
 def test_nothing_else_passes_for_a_target():
     """Stains, marks, lines, seals, discs of another size, squares: each missed, and in words."""
     road = furnished_road()

@@ -123,6 +123,7 @@ def projected(folder: Path, place: np.ndarray) -> dict[str, tuple[float, float, 
     return found
 
 
+@pytest.mark.slow
 def test_the_best_pictures_are_those_that_a_projection_gives(street: Simulated) -> None:
     signs = signs_of(session(street))
     for number in range(5):
@@ -140,6 +141,7 @@ def test_the_best_pictures_are_those_that_a_projection_gives(street: Simulated) 
             assert (one["run"], one["camera"]) == ("run-1", "camera")
 
 
+@pytest.mark.slow
 def test_a_sign_from_behind_or_behind_a_van_has_no_picture(street: Simulated) -> None:
     signs = signs_of(session(street))
     assert projected(street.survey_file.parent, np.array(KnownSigns.assets[BACK][0].coords[0]))
@@ -149,6 +151,7 @@ def test_a_sign_from_behind_or_behind_a_van_has_no_picture(street: Simulated) ->
     assert len(in_pictures) >= 2 and pd.isna(signs["pictures"][BEHIND_VAN])
 
 
+@pytest.mark.slow
 def test_colours_and_shapes_are_those_of_the_faces(street: Simulated) -> None:
     signs = signs_of(session(street))
     assert signs["colour"].tolist()[:5] == COLOURS
@@ -158,6 +161,7 @@ def test_colours_and_shapes_are_those_of_the_faces(street: Simulated) -> None:
     assert (signs["type"][:5] == "unknown").all() and signs["type"][5:].isna().all()  # nothing is drawn on them
 
 
+@pytest.mark.slow
 def test_cut_outs_show_the_plate_in_their_middle(street: Simulated) -> None:
     own = session(street)
     signs = signs_of(own)
@@ -171,6 +175,7 @@ def test_cut_outs_show_the_plate_in_their_middle(street: Simulated) -> None:
         assert name.endswith(f"{signs['object'][number]}_1.jpg")
 
 
+@pytest.mark.slow
 def test_lines_have_the_colour_of_their_paint(street: Simulated) -> None:
     table = geopandas.read_parquet(session(street).store.path("products/assets/lane_lines.parquet"))
     aside = [table.geometry.distance(line).idxmin() for line, _ in KnownLines.assets]
@@ -179,6 +184,7 @@ def test_lines_have_the_colour_of_their_paint(street: Simulated) -> None:
     assert table["pictures"].notna().all()
 
 
+@pytest.mark.slow
 def test_a_second_run_does_nothing_and_what_is_gone_is_made_again(street: Simulated, tmp_path: Path) -> None:
     folder = tmp_path / "survey"
     shutil.copytree(street.survey_file.parent, folder)
@@ -202,6 +208,7 @@ def test_people_do_not_edit_what_tells_of_the_evidence() -> None:
     assert not {"cut_out", "colour_probability", "pictures"} & editable_columns("sign")
 
 
+@pytest.mark.slow
 def test_a_picture_that_cannot_be_read_is_named_and_the_next_is_taken(street: Simulated, tmp_path: Path) -> None:
     folder = tmp_path / "survey"
     shutil.copytree(street.survey_file.parent, folder)
@@ -216,6 +223,7 @@ def test_a_picture_that_cannot_be_read_is_named_and_the_next_is_taken(street: Si
     assert signs_of(own)["colour"][0] == "red"
 
 
+@pytest.mark.slow
 def test_thumbnails_of_the_report_are_the_cut_outs(street: Simulated) -> None:
     blocks = list(AssetsSection().blocks(Material(session(street))))
     pictures = [block for block in blocks if isinstance(block, Picture)]
@@ -225,6 +233,7 @@ def test_thumbnails_of_the_report_are_the_cut_outs(street: Simulated) -> None:
         assert drawn.shape[0] == 220 and drawn.std() > 5.0
 
 
+@pytest.mark.slow
 def test_a_site_leads_from_a_sign_to_its_pictures_its_cut_out_and_its_pass(street: Simulated, tmp_path: Path) -> None:
     of = session(street)
     site = SiteMaterial(of)
@@ -249,6 +258,7 @@ def test_a_site_leads_from_a_sign_to_its_pictures_its_cut_out_and_its_pass(stree
     assert unknown == {"title": "picture <b> c ../x", "kind": "picture"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("pictures", "words"),
     [({"cameras": ["eye"]}, "the rig has no camera 'eye'"), ({"recogniser": "none.onnx"}, "recogniser")],

@@ -72,6 +72,7 @@ def test_without_drives_nothing_is_added() -> None:
     assert (none.sigma_m(np.zeros((2, 2)), np.zeros((2, 2), np.int64)) == 0.0).all()
 
 
+@pytest.mark.slow
 def test_poses_that_are_off_by_decimetres_make_places_that_say_so(tmp_path: Path) -> None:
     """A post beside a drive whose trajectory states 0.3 m for each axis, and is off by as much."""
     scene = Scene.load("demo").changed(

@@ -100,6 +100,7 @@ def true_posts(street: Simulated) -> pd.DataFrame:
     return pd.read_parquet(street.survey_file.parent / "truth" / "objects.parquet")
 
 
+@pytest.mark.slow
 def test_the_inventory_learns_which_places_the_pass_had_in_sight(street: Simulated) -> None:
     own = session(street)
     sight = truth_of(own).rules.visibility
@@ -112,6 +113,7 @@ def test_the_inventory_learns_which_places_the_pass_had_in_sight(street: Simulat
     assert truth_of(unasked).rules.visibility.expected_passes("pole", true).tolist() == [-1, -1, -1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tile_m", [10.0, 15.0, 60.0])
 def test_objects_and_classes_are_the_same_for_any_cut(street: Simulated, tile_m: float, tmp_path: Path) -> None:
     own, other = session(street), run(again(street, tmp_path, tile_m=tile_m), ["assets"])
@@ -131,6 +133,7 @@ def classified(of: Session) -> np.ndarray:
     return joined[np.lexsort(joined.T[::-1])]
 
 
+@pytest.mark.slow
 def test_posts_stand_where_the_truth_has_them(street: Simulated) -> None:
     own = session(street)
     found = geopandas.read_parquet(own.store.path("products/assets/poles.parquet"))
@@ -158,6 +161,7 @@ def test_posts_stand_where_the_truth_has_them(street: Simulated) -> None:
     assert found["pictures"].isna().all()
 
 
+@pytest.mark.slow
 def test_every_file_holds_the_same_posts(street: Simulated) -> None:
     own = session(street)
     folder = Path(own.store.path("products/assets"))
@@ -181,6 +185,7 @@ def test_every_file_holds_the_same_posts(street: Simulated) -> None:
     assert sorted(asked["object"].to_pylist()) == sorted(table["object"])
 
 
+@pytest.mark.slow
 def test_points_have_classes_and_files_say_what_these_are(street: Simulated) -> None:
     own = session(street)
     codes: dict[int, int] = {}
@@ -199,6 +204,7 @@ def test_points_have_classes_and_files_say_what_these_are(street: Simulated) -> 
     assert sum(codes.values()) == loaded["n"][0].as_py()
 
 
+@pytest.mark.slow
 def test_bare_earth_is_the_ground_and_has_holes(street: Simulated) -> None:
     own = session(street)
     largest = max(own.store.files("products/classified_points"), key=own.store.size)
@@ -227,6 +233,7 @@ def test_bare_earth_is_the_ground_and_has_holes(street: Simulated) -> None:
     assert holes > 0
 
 
+@pytest.mark.slow
 def test_cross_sections_cross_the_road_on_bare_earth(street: Simulated) -> None:
     own = session(street)
     rows = pd.read_csv(own.store.path("products/ground_sections/road1.csv"))
@@ -251,6 +258,7 @@ def test_cross_sections_cross_the_road_on_bare_earth(street: Simulated) -> None:
     assert 0.0 < rows["sigma_height_m"].median() < 0.05
 
 
+@pytest.mark.slow
 def test_cross_sections_that_are_asked_for_later_are_due(street: Simulated) -> None:
     own = session(street)
     assert Assets().state(own).stale == 0
@@ -264,6 +272,7 @@ class Backwards(Inline):
         return super().map(function, list(tasks)[::-1])
 
 
+@pytest.mark.slow
 def test_blocks_and_their_order_change_no_byte(street: Simulated, tmp_path: Path) -> None:
     whole = files(session(street))
     other = again(street, tmp_path, max_block_returns=1)
@@ -274,6 +283,7 @@ def test_blocks_and_their_order_change_no_byte(street: Simulated, tmp_path: Path
     assert files(other) == whole
 
 
+@pytest.mark.slow
 def test_a_second_run_does_nothing(street: Simulated, monkeypatch: pytest.MonkeyPatch) -> None:
     own = session(street)
     assert Assets().state(own).stale == 0
@@ -282,6 +292,7 @@ def test_a_second_run_does_nothing(street: Simulated, monkeypatch: pytest.Monkey
     run(own, ("assets",))
 
 
+@pytest.mark.slow
 def test_reprocessing_a_tile_redoes_what_it_touches(
     street: Simulated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -305,6 +316,7 @@ def test_reprocessing_a_tile_redoes_what_it_touches(
     assert files(own) == before
 
 
+@pytest.mark.slow
 def test_changed_evidence_joins_the_objects_near_it_and_no_other(street: Simulated, tmp_path: Path) -> None:
     own = again(street, tmp_path)
     manifest, post = own.manifest, true_posts(street).iloc[0]
@@ -318,6 +330,7 @@ def test_changed_evidence_joins_the_objects_near_it_and_no_other(street: Simulat
     assert [task.pieces for task in due_joins(work.plan, manifest)] == [(held._replace(digest="0" * 32),)]
 
 
+@pytest.mark.slow
 def test_a_run_that_is_stopped_before_the_join_goes_on(
     street: Simulated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -343,6 +356,7 @@ class Broken(Posts):
         raise RuntimeError("no such luck")
 
 
+@pytest.mark.slow
 def test_a_kind_at_fault_costs_no_other(street: Simulated, tmp_path: Path) -> None:
     whole = files(session(street))
     with only_kinds(Posts, Broken):
@@ -354,6 +368,7 @@ def test_a_kind_at_fault_costs_no_other(street: Simulated, tmp_path: Path) -> No
     assert files(own)[poles] == whole[poles]
 
 
+@pytest.mark.slow
 def test_without_the_section_nothing_stays(street: Simulated, tmp_path: Path) -> None:
     own = again(street, tmp_path)
     own.survey = changed(own.survey, {"assets": None})
@@ -362,6 +377,7 @@ def test_without_the_section_nothing_stays(street: Simulated, tmp_path: Path) ->
     assert Assets().state(own).stale == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
@@ -377,6 +393,7 @@ def test_settings_are_checked_before_work(street: Simulated, settings: dict[str,
         raise fault
 
 
+@pytest.mark.slow
 def test_python_gets_a_geodataframe(street: Simulated) -> None:
     survey = roadscan.open_survey(street.survey_file)
     found = survey.assets("pole")
@@ -387,6 +404,7 @@ def test_python_gets_a_geodataframe(street: Simulated) -> None:
     assert detail == {"objects": 3}
 
 
+@pytest.mark.slow
 def test_the_report_shows_the_posts(street: Simulated) -> None:
     own = session(street)
     blocks = list(AssetsSection().blocks(Material(own)))

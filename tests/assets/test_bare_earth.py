@@ -38,6 +38,7 @@ def total_errors(recordings: Path, method: str) -> dict[str, float]:
     return found
 
 
+@pytest.mark.slow
 def test_airborne_samples_of_the_filter_test(recordings: Path) -> None:
     # A plain simple morphological filter has 4.0 % in the mean, each sample left out of the choice of its setting.
     wrong = total_errors(recordings, "morphological")
@@ -133,6 +134,7 @@ def test_planes_by_name() -> None:
     assert np.array_equal(alone[inner], ground[near][inner])
 
 
+@pytest.mark.slow
 def test_a_simulated_street_has_its_own_surface_again() -> None:
     scene = Street.load("urban_street").changed(
         length_m=6.0,

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import geopandas
 import numpy as np
+import pytest
 
 from tests.assets.isprs_run import CORNER_M, run_cloud
 
@@ -23,6 +24,7 @@ def cloud(rng: np.random.Generator) -> np.ndarray:
     return points + rng.normal(0.0, 0.008, points.shape)
 
 
+@pytest.mark.slow
 def test_posts_of_a_cloud_without_a_trajectory(tmp_path: Path) -> None:
     run_cloud(cloud(np.random.default_rng(20261127)), tmp_path, "[assets]\n")
     files = list(tmp_path.rglob("products/assets/poles.parquet"))

@@ -45,6 +45,7 @@ def seen(made: StreetScene) -> Street:
     return street(made)
 
 
+@pytest.mark.slow
 def test_covers_and_drains_are_found_with_their_type_and_size(made: StreetScene, seen: Street) -> None:
     box, returns = Box(-60.0, -60.0, 60.0, 60.0), seen.returns
     scene = make_scene(returns.at(box.holds(returns.x_m, returns.y_m)), box, box, seen.drive_xyh_m)

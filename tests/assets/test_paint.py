@@ -71,6 +71,7 @@ def town() -> SimulatedStreet:
     return street("urban_street", 100.0, 20.0)
 
 
+@pytest.mark.slow
 def test_markings_of_the_labelled_street() -> None:
     scene, labels = semantic_kitti_scene(40.0)
     score = f1_of_cells(calibrated(scene), labels == 60, ~np.isin(labels, NOT_JUDGED))
@@ -114,6 +115,7 @@ def test_lines_of_the_highway_have_their_type_width_and_place() -> None:
     assert all(abs(line.attributes["gap_m"] - 9.0) <= 0.1 for line in dashed)
 
 
+@pytest.mark.slow
 def test_two_lines_side_by_side_are_a_double_line() -> None:
     """The gaps between them are 10, 15 and 18 cm wide, as painted on roads, or 38 cm."""
     dashed = {"dash_m": 3.0, "gap_m": 6.0}

@@ -88,6 +88,7 @@ def left_over(scene: Scene, framed: np.ndarray, last_s: float = 0.0) -> tuple[fl
     return float(free[counted & (framed == CAR)].mean()), float(free[counted & (framed == PERSON)].mean())
 
 
+@pytest.mark.slow
 def test_three_seconds_of_a_drive() -> None:
     """Who follows the recording car is seen where that has just been, and belongs to no frame."""
     scene, framed = drive(slice(30, 40))

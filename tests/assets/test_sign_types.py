@@ -35,6 +35,7 @@ def test_the_list_is_that_of_the_drawings() -> None:
     assert {f"vienna:C14-{v}" for v in range(20, 140, 10)} | {f"mutcd:R2-1-{v}" for v in range(15, 85, 5)} <= codes
 
 
+@pytest.mark.slow
 def test_each_type_is_told_and_what_is_not_listed_is_unknown() -> None:
     told = [sign_types().type_of([plate(k, 48.0)], "both")[0] for k in range(len(FACES))]
     right = sum(one == own.code for one, own in zip(told, FACES, strict=True))

@@ -38,6 +38,7 @@ def seen(made: StreetScene) -> Street:
     return street(made)
 
 
+@pytest.mark.slow
 def test_furniture_is_found_with_its_type_and_size_and_nothing_else_is(made: StreetScene, seen: Street) -> None:
     returns = seen.returns
     box = Box(-60.0, -60.0, 60.0, 60.0)
@@ -57,6 +58,7 @@ def test_furniture_is_found_with_its_type_and_size_and_nothing_else_is(made: Str
     assert len(found) - len(used) <= 1
 
 
+@pytest.mark.slow
 def test_things_and_their_features_turn_with_the_street(seen: Street) -> None:
     returns = seen.returns
     box = Box(-60.0, -60.0, 60.0, 60.0)

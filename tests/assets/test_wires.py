@@ -53,6 +53,7 @@ def found(seen: Street) -> list[AssetObject]:
     return list(Wire().objects(Wire().evidence(scene, None).pieces, None, {}))
 
 
+@pytest.mark.slow
 def test_wires_are_found_from_support_to_support_and_nothing_else_is(found: list[AssetObject], seen: Street) -> None:
     lengths = sorted(one.geometry.length for one in found)
     assert len(found) == 4
@@ -60,6 +61,7 @@ def test_wires_are_found_from_support_to_support_and_nothing_else_is(found: list
     assert all(one.probability > 0.8 for one in found)
 
 
+@pytest.mark.slow
 def test_sag_and_clearance_are_those_of_the_wires(found: list[AssetObject]) -> None:
     along = [one for one in found if one.geometry.length > 20.0]
     assert sorted(one.attributes["sag_m"] for one in along) == pytest.approx(sorted(SAGS_M[:3]), abs=0.06)
@@ -67,6 +69,7 @@ def test_sag_and_clearance_are_those_of_the_wires(found: list[AssetObject]) -> N
     assert lowest == pytest.approx([5.65, 6.1, 6.25], abs=0.1)
 
 
+@pytest.mark.slow
 def test_a_wire_is_the_same_wherever_squares_are_cut(seen: Street) -> None:
     returns, wire = seen.returns, Wire()
     whole = Box(-60.0, -60.0, 60.0, 60.0)

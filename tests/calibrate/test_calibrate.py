@@ -71,6 +71,7 @@ def calibrated(yard: Path) -> tuple[Survey, Calibrated]:
     return survey, calibrate_survey(survey, store_of(survey))
 
 
+@pytest.mark.slow
 def test_heads_on_one_object_with_their_imus(yard: Path, calibrated: tuple[Survey, Calibrated]) -> None:
     _, done = calibrated
     truth = Rig.load(yard.parent / "truth" / "RIG.toml")
@@ -90,6 +91,7 @@ def test_heads_on_one_object_with_their_imus(yard: Path, calibrated: tuple[Surve
     assert "vertical lever arm of 'profiler_left', 'profiler_right' together" in words
 
 
+@pytest.mark.slow
 def test_what_it_wrote_is_what_readings_are_placed_by(calibrated: tuple[Survey, Calibrated]) -> None:
     survey, done = calibrated
     store = store_of(survey)
@@ -107,6 +109,7 @@ def test_what_it_wrote_is_what_readings_are_placed_by(calibrated: tuple[Survey, 
     assert "vertical lever arm" in row["not_determined"]
 
 
+@pytest.mark.slow
 def test_a_report_that_is_gone_or_damaged_is_seen_and_written_again(calibrated: tuple[Survey, Calibrated]) -> None:
     """From its record: a run calibrates nothing."""
     survey, _ = calibrated
@@ -124,6 +127,7 @@ def test_a_report_that_is_gone_or_damaged_is_seen_and_written_again(calibrated: 
     assert ", not determined: " in line and "vertical lever arm" in line and line.endswith(PICTURE)
 
 
+@pytest.mark.slow
 def test_a_later_calibration_stands_beside_the_first(yard: Path, calibrated: tuple[Survey, Calibrated]) -> None:
     entries = [stop_and_go("profiler_left")]
     later = {"calibration": entries, "navigation__calibration": {"valid_from": "2026-03-02T12:03:00Z"}}
@@ -134,6 +138,7 @@ def test_a_later_calibration_stands_beside_the_first(yard: Path, calibrated: tup
     assert len(dated[("*", "profiler_right")]) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("entries", "words"),
     [
@@ -148,6 +153,7 @@ def test_what_the_survey_does_not_have_is_named(yard: Path, entries: list[dict[s
         calibrate_survey(survey, store_of(survey))
 
 
+@pytest.mark.slow
 def test_a_lidar_against_a_reference_scan(tmp_path: Path) -> None:
     scene = Scene.load("calibration_yard").changed(
         profilers={"on": False}, sick={"on": False}, camera={"on": False}, gnss={"on": False}, encoder={"on": False},
@@ -178,6 +184,7 @@ def test_a_lidar_against_a_reference_scan(tmp_path: Path) -> None:
     assert np.abs((lever - arm) / found.sigma[:3]).max() < 4.0
 
 
+@pytest.mark.slow
 def test_evidence_that_finds_nothing_is_refused_and_what_was_known_stays(
     yard: Path, calibrated: tuple[Survey, Calibrated]
 ) -> None:
@@ -192,6 +199,7 @@ def test_evidence_that_finds_nothing_is_refused_and_what_was_known_stays(
     assert store.read_bytes(small_path("mountings")) == before
 
 
+@pytest.mark.slow
 def test_an_overlap_of_whole_runs_is_refused_before_their_readings_are_loaded(yard: Path) -> None:
     entry = {"kind": "overlap", "sensors": ["profiler_left"]}
     survey = changed(Survey.load(yard), {"calibration": [entry]})
@@ -199,6 +207,7 @@ def test_an_overlap_of_whole_runs_is_refused_before_their_readings_are_loaded(ya
         calibrate_survey(survey, store_of(survey))
 
 
+@pytest.mark.slow
 def test_status_says_when_the_rig_is_another_than_the_calibrated_one(calibrated: tuple[Survey, Calibrated]) -> None:
     survey, _ = calibrated
     store = store_of(survey)
@@ -209,6 +218,7 @@ def test_status_says_when_the_rig_is_another_than_the_calibrated_one(calibrated:
     assert any("profiler_right" in note for note in outdated_calibrations(plan_survey(other, store)))
 
 
+@pytest.mark.slow
 def test_a_damaged_table_is_calibrated_anew(calibrated: tuple[Survey, Calibrated]) -> None:
     survey, done = calibrated
     store, said, name = store_of(survey), [], "profiler_left"

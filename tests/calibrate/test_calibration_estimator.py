@@ -120,6 +120,7 @@ class Yard:
         return np.concatenate(parts)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_residuals():
     rng = np.random.default_rng(1)
     yard = Yard(rng)

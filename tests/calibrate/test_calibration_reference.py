@@ -220,6 +220,7 @@ def rank(found: Registration) -> int:
     return int((np.linalg.eigvalsh(scaled) > 1.0).sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_driving_scan_from_its_nominal_mounting(site: Site, seed: int):
     assert np.degrees(np.linalg.norm(off(site.nominal, site.true)[3:])) > 1.5
@@ -231,12 +232,14 @@ def test_a_driving_scan_from_its_nominal_mounting(site: Site, seed: int):
     assert found.fates["tied"] == len(found.ties.weight) > 5_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [4, 5, 6])
 def test_a_standing_scan(site: Site, seed: int):
     found = register(site.standing(seed), site.reference(seed), away(site.true, 1.5, 0.08, seed))
     assert within_bar(off(found.mounting, site.true)), off(found.mounting, site.true)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["standing", "moving"])
 @pytest.mark.parametrize("seed", [7])
 def test_a_start_without_a_nominal_mounting(site: Site, seed: int, kind: str):
@@ -246,6 +249,7 @@ def test_a_start_without_a_nominal_mounting(site: Site, seed: int, kind: str):
     assert within_bar(off(found.mounting, site.true)), off(found.mounting, site.true)
 
 
+@pytest.mark.slow
 def test_sigma_is_honest(site: Site):
     """Errors over their covariance: six degrees of freedom, mean of 5 seeds within its 99.9 % limits."""
     normalised = []
@@ -257,6 +261,7 @@ def test_sigma_is_honest(site: Site):
     assert chi2.ppf(0.0005, 30) / 5 < np.mean(normalised) < chi2.ppf(0.9995, 30) / 5
 
 
+@pytest.mark.slow
 def test_against_plain_small_gicp(site: Site):
     """Of a standing scan plain ICP finds the mounting too; of a driving one only the exact poses do."""
     reference = site.reference(9)
@@ -285,6 +290,7 @@ def test_against_plain_small_gicp(site: Site):
     assert size(plain(site.moving())) > 0.1 > 0.003 > size(register(site.moving(), reference, site.nominal).mounting)
 
 
+@pytest.mark.slow
 def test_half_the_reference_and_things_that_moved(site: Site):
     """The reference lacks half the site, and a wall and a car stand in it that the mobile scan never saw."""
     rng = np.random.default_rng(10)
@@ -301,6 +307,7 @@ def test_half_the_reference_and_things_that_moved(site: Site):
         assert within_bar(off(one.mounting, site.true)), off(one.mounting, site.true)
 
 
+@pytest.mark.slow
 def test_a_plane_alone_determines_three_directions(site: Site):
     """Flat ground: height, roll and pitch. Of the rest the ties hold nothing, and the mounting keeps what it was."""
     rng = np.random.default_rng(11)
@@ -337,6 +344,7 @@ def test_a_plane_alone_determines_three_directions(site: Site):
     assert rank(full) == 6
 
 
+@pytest.mark.slow
 def test_the_estimator_takes_the_ties(site: Site):
     """What the estimator makes of them: the bar again, with its own covariance, nothing left open."""
     found = register(site.moving(), site.reference(16), site.nominal)
@@ -348,6 +356,7 @@ def test_the_estimator_takes_the_ties(site: Site):
     assert error @ np.linalg.solve(result.covariance, error) < 22.5  # 99.9 % of chi-squared with 6
 
 
+@pytest.mark.slow
 def test_scans_that_do_not_meet_are_refused(site: Site):
     with pytest.raises(ConfigError, match="one frame"):
         register(site.moving(), site.reference(12) + np.array([500.0, 0.0, 0.0]), site.nominal)
@@ -377,6 +386,7 @@ def test_planes_and_their_own_uncertainty():
     assert np.std(errors) == pytest.approx(np.sqrt(np.mean(variances)), rel=0.15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [20, 21])
 def test_a_start_far_beyond_what_was_stated_is_not_silently_wrong(site: Site, seed: int):
     """Either the search gets there all the same, or it says that it did not."""

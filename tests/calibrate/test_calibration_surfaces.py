@@ -50,6 +50,7 @@ def images(shift_m: tuple[float, float], noise: float, relief: float = 1.0) -> t
     return tuple(a + noise * smooth(rng.standard_normal(field.shape), 1.5) for a in (field, moved))
 
 
+@pytest.mark.slow
 def test_patches_find_a_fourier_shift_and_their_sigma_is_honest():
     true = np.array([0.0013, -0.0021, 0.003])
     shift, crossed, mean, spread, count = matched(*images((true[0], true[1]), 3e-5))
@@ -97,6 +98,7 @@ def drive(name: str, start_s: float, heading: float, rng: np.random.Generator, t
     return Readings("lidar", name, points[good], pose[good], epochs, position, rotation)
 
 
+@pytest.mark.slow
 def test_planes_of_a_yard_give_the_mounting_and_say_what_they_do_not():
     rng = np.random.default_rng(3)
     rotation = Rotation.from_euler("ZYX", [3.0, 12.0, 1.0], degrees=True).as_matrix()
@@ -116,6 +118,7 @@ def test_planes_of_a_yard_give_the_mounting_and_say_what_they_do_not():
     assert one.sigma[2] > 3 * one.sigma[:2].max()
 
 
+@pytest.mark.slow
 def test_profilers_of_the_simulated_yard():
     yard = profiler_yard(seed=3, drives=3, position_m=0.0, attitude_deg=0.0, length_m=3.5)
     found = solved(yard)

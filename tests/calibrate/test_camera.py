@@ -79,6 +79,7 @@ def bench(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_the_interior_orientation_goes_into_the_rig_file(bench: Path):
     rig_file = bench / "RIG.toml"
     looked = calibrate_interior(bench / "pictures", BOARD, rig_file, "camera", write=False)
@@ -166,6 +167,7 @@ def folder(driven: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(driven, tmp_path / "survey"))
 
 
+@pytest.mark.slow
 def test_resection_writes_the_mounting(folder: Path):
     survey = Survey.load(folder / "SURVEY.toml")
     before = (folder / "RIG.toml").read_text()
@@ -195,6 +197,7 @@ def test_resection_writes_the_mounting(folder: Path):
     np.testing.assert_allclose(again.resection.found.sigma, found.sigma, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_a_rotation_that_the_rig_file_states_whole_is_written_whole(folder: Path):
     rig_file = folder / "RIG.toml"
     rotation = Rig.load(rig_file).sensors["camera"].mounting().body_from_sensor
@@ -211,6 +214,7 @@ def test_a_rotation_that_the_rig_file_states_whole_is_written_whole(folder: Path
     assert "# sheet" in rig_file.read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lines", "error", "words"),
     [
@@ -228,6 +232,7 @@ def test_measurements_that_do_not_fit(driven: Path, tmp_path: Path, lines: list[
         resect_camera(Survey.load(driven / "SURVEY.toml"), store_of(driven), "camera", file)
 
 
+@pytest.mark.slow
 def test_a_camera_without_interior_orientation_or_pictures(folder: Path):
     rig_file, survey_file = folder / "RIG.toml", folder / "SURVEY.toml"
     text = rig_file.read_text()

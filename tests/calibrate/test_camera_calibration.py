@@ -98,6 +98,7 @@ def numbers(interior: Interior) -> tuple[np.ndarray, np.ndarray]:
     return estimate, np.array([*interior.sigma_focal_px, *interior.sigma_principal_px, *interior.sigma_distortion])
 
 
+@pytest.mark.slow
 def test_the_interior_orientation_is_recovered_within_its_sigma(pictures):
     """A pixel whose centre is half a pixel off, or a tangential term of the wrong sign, is many σ."""
     report = interior_from_pictures(pictures, BOARD, date=dt.date(2026, 3, 1))
@@ -121,6 +122,7 @@ def test_the_interior_orientation_is_recovered_within_its_sigma(pictures):
         assert picture.distance_m == pytest.approx(np.linalg.norm(middle), rel=0.005)
 
 
+@pytest.mark.slow
 def test_pictures_are_left_out_with_reasons(pictures):
     # A board that is not flat: its picture, moved aside and bent by up to 3 px.
     column, row = np.meshgrid(np.arange(SIZE[0], dtype=np.float32), np.arange(SIZE[1], dtype=np.float32))
@@ -145,6 +147,7 @@ def test_pictures_are_left_out_with_reasons(pictures):
     )
 
 
+@pytest.mark.slow
 def test_pictures_that_tell_too_little_are_refused(pictures):
     with pytest.raises(ConfigError, match=r"3 of 3 pictures .* at least 6"):
         interior_from_pictures(pictures[:3], BOARD)
@@ -159,6 +162,7 @@ def test_pictures_that_tell_too_little_are_refused(pictures):
         interior_from_pictures(pictures[:4], BOARD, few)
 
 
+@pytest.mark.slow
 def test_boards_that_were_never_tilted_are_refused():
     camera = Renderer()
     turns = Rotation.from_euler("z", [[5], [25], [45], [65]], degrees=True)
@@ -305,6 +309,7 @@ def found_by(drive: Drive, exposures: list[Exposure], targets: list[Target], mea
     return resect("camera", drive.sensor.interior, prior, exposures, targets, measured, sigma_px)
 
 
+@pytest.mark.slow
 def test_exact_measurements_give_the_true_mounting(drive: Drive):
     rng = np.random.default_rng(1)
     measured = drive.measured(rng, 0.0)
@@ -316,6 +321,7 @@ def test_exact_measurements_give_the_true_mounting(drive: Drive):
     assert found.outliers == found.found.not_determined == ()
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_their_covariance_says(drive: Drive):
     """Errors of poses, of control points and of measurements; 15 seeds, mean of six between its 99.9 % limits."""
     normalised = []
@@ -330,6 +336,7 @@ def test_errors_are_as_large_as_their_covariance_says(drive: Drive):
     assert low < np.mean(normalised) < high, np.mean(normalised)
 
 
+@pytest.mark.slow
 def test_wrong_measurements_are_named(drive: Drive):
     rng = np.random.default_rng(2)
     measured = drive.measured(rng, 0.3)
@@ -346,6 +353,7 @@ def test_wrong_measurements_are_named(drive: Drive):
     assert found.rms_px < 0.6
 
 
+@pytest.mark.slow
 def test_a_rig_file_that_knows_no_mounting(drive: Drive):
     """The rig file's axes are wrong by a right angle: one picture by itself is the start."""
     rng = np.random.default_rng(3)
@@ -361,6 +369,7 @@ def test_a_rig_file_that_knows_no_mounting(drive: Drive):
     assert np.abs(error[3:]).max() < np.radians(0.3)
 
 
+@pytest.mark.slow
 def test_one_point_does_not_determine_a_mounting(drive: Drive):
     rng = np.random.default_rng(4)
     only = [m for m in drive.measured(rng, 0.2) if m.point == "T1"]
@@ -371,6 +380,7 @@ def test_one_point_does_not_determine_a_mounting(drive: Drive):
     assert np.abs(drive.error(found.mounting)).max() < 0.25, "what is not determined stays near the rig file's"
 
 
+@pytest.mark.slow
 def test_targets_measured_in_the_simulated_pictures(drive: Drive):
     """Centres of the dark discs as they appear in the pictures, by their grey values."""
     rng = np.random.default_rng(5)
@@ -400,6 +410,7 @@ def test_targets_measured_in_the_simulated_pictures(drive: Drive):
     assert error @ np.linalg.solve(found.found.covariance, error) < 22.5
 
 
+@pytest.mark.slow
 def test_measurements_that_cannot_be_used_are_refused(drive: Drive):
     rng = np.random.default_rng(6)
     measured = drive.measured(rng, 0.2)
@@ -419,6 +430,7 @@ def test_measurements_that_cannot_be_used_are_refused(drive: Drive):
     refused("agree with one mounting", *elsewhere)
 
 
+@pytest.mark.slow
 def test_a_distortion_without_inverse_is_refused(drive: Drive):
     rng = np.random.default_rng(7)
     folding = drive.sensor.interior.model_copy(update={"distortion": (-1.5, 0.0, 0.0, 0.0, 0.0)})
@@ -429,6 +441,7 @@ def test_a_distortion_without_inverse_is_refused(drive: Drive):
         )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_projection_in_sensor_axes(drive: Drive):
     """Against the test's own projection, and there and back."""
     row = drive.rows[1]

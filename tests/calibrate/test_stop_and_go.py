@@ -91,6 +91,7 @@ def yards(tmp_path_factory) -> list[Yard]:
     return [Yard(tmp_path_factory.mktemp("yard") / "s", seed) for seed in (21, 22)]
 
 
+@pytest.mark.slow
 def test_orientations_come_back_with_honest_sigma(yards):
     squares = []
     for yard in yards:
@@ -109,6 +110,7 @@ def test_orientations_come_back_with_honest_sigma(yards):
     assert sum(squares) > chi2.ppf(0.005, 3 * len(squares))
 
 
+@pytest.mark.slow
 def test_sigma_stays_honest_with_cheap_imus(tmp_path):
     """Biases that wander by 0.2 mg a second: σ has to know that they do not average out within a curve."""
     yard = Yard(tmp_path / "s", 33, "mems")
@@ -121,6 +123,7 @@ def test_sigma_stays_honest_with_cheap_imus(tmp_path):
     assert sum(squares) < chi2.ppf(0.995, 6)
 
 
+@pytest.mark.slow
 def test_it_is_the_rotation_that_aligns_the_turns_of_head_and_body(yards):
     """Rates of the head's gyroscopes against rates of the true trajectory, aligned by SciPy."""
     yard, head = yards[0], "profiler_right"
@@ -142,6 +145,7 @@ def test_it_is_the_rotation_that_aligns_the_turns_of_head_and_body(yards):
     assert np.linalg.norm(yard.error(head, found)) < worse
 
 
+@pytest.mark.slow
 def test_biases_are_found_too(yards):
     yard = yards[1]
     found = yard.find("profiler_left")
@@ -152,6 +156,7 @@ def test_biases_are_found_too(yards):
     assert np.abs(found.late_s).max() < 2e-4
 
 
+@pytest.mark.slow
 def test_a_late_clock_is_found(yards):
     yard, head = yards[1], "profiler_left"
     late_ns = 4_000_000
@@ -164,6 +169,7 @@ def test_a_late_clock_is_found(yards):
     assert np.degrees(np.abs(yard.error(head, found))).max() < 0.02
 
 
+@pytest.mark.slow
 def test_standing_alone_leaves_the_heading(yards):
     yard, head = yards[0], "profiler_left"
     runs = [replace(run, readings=_first(run.readings, 9.0)) for run in yard.head_runs(head)]
@@ -182,6 +188,7 @@ def test_standing_alone_leaves_the_heading(yards):
     assert f"roll of '{head}'" not in result.observability.undetermined
 
 
+@pytest.mark.slow
 def test_the_head_takes_the_orientation_of_its_imu(yards):
     yard, head = yards[0], "profiler_right"
     found = yard.find(head)
@@ -196,6 +203,7 @@ def test_the_head_takes_the_orientation_of_its_imu(yards):
     assert evidence.covariance_rad2 is found.covariance_rad2
 
 
+@pytest.mark.slow
 def test_an_error_of_the_trajectory_turns_the_head_as_its_influence_says(yards):
     yard, head = yards[0], "profiler_left"
     run = yard.head_runs(head)[2]
@@ -218,6 +226,7 @@ def test_an_error_of_the_trajectory_turns_the_head_as_its_influence_says(yards):
     assert change == pytest.approx(expected, abs=0.05 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_heads_share_the_error_of_the_trajectory(yards):
     heads = [yards[0].find(head) for head in HEADS]
     nominal = Mounting((0.0, 0.0, 0.0), tuple(map(tuple, np.eye(3).tolist())))
@@ -232,6 +241,7 @@ def test_heads_share_the_error_of_the_trajectory(yards):
     assert 0.0 < correlation[2, 2] < 0.7
 
 
+@pytest.mark.slow
 def test_gaps_and_damaged_samples_cost_their_windows(yards):
     yard, head = yards[1], "profiler_left"
     whole = yard.head_runs(head)[0]
@@ -246,6 +256,7 @@ def test_gaps_and_damaged_samples_cost_their_windows(yards):
     assert np.degrees(np.abs(yard.error(head, found))).max() < 0.02
 
 
+@pytest.mark.slow
 def test_wrong_axes_and_missing_poses_are_refused(yards):
     yard, head = yards[0], "profiler_left"
     run = yard.head_runs(head)[0]

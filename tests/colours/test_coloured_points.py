@@ -60,6 +60,7 @@ def coloured(street: Street) -> Session:
     return street.run(street.survey)
 
 
+@pytest.mark.slow
 def test_points_have_the_colours_of_what_they_lie_on(street: Street, coloured: Session) -> None:
     assert not coloured.failures
     found = judged(street.folder, Path(coloured.store.path("products/coloured_points")))
@@ -72,6 +73,7 @@ def test_points_have_the_colours_of_what_they_lie_on(street: Street, coloured: S
     assert np.mean(found.pictures[lane] > 0) >= 0.98  # the rest lies beside the car ahead, within a coarse pixel or two
 
 
+@pytest.mark.slow
 def test_files_say_what_has_no_colour(coloured: Session) -> None:
     files = sorted(Path(coloured.store.path("products/coloured_points")).glob("*.laz"))
     points = unseen = 0
@@ -90,6 +92,7 @@ def test_files_say_what_has_no_colour(coloured: Session) -> None:
     assert 0 < unseen < points
 
 
+@pytest.mark.slow
 def test_orthophoto_is_one_raster_with_the_pictures_it_came_from(street: Street, coloured: Session) -> None:
     folder = Path(coloured.store.path("products/orthophoto"))
     with rasterio.open(folder / "orthophoto.vrt") as whole:
@@ -120,6 +123,7 @@ def test_orthophoto_is_one_raster_with_the_pictures_it_came_from(street: Street,
     assert road.mean() > 0.999
 
 
+@pytest.mark.slow
 def test_blocks_and_workers_change_no_byte(street: Street, coloured: Session) -> None:
     first = street.products(coloured)
     assert first
@@ -128,6 +132,7 @@ def test_blocks_and_workers_change_no_byte(street: Street, coloured: Session) ->
     assert street.products(street.run(single, TwoThreads())) == first
 
 
+@pytest.mark.slow
 def test_a_second_run_does_nothing_and_blank_pictures_cost_themselves(street: Street, coloured: Session) -> None:
     again = street.run(street.survey)
     state = COLOURS[0].state(again)
@@ -151,6 +156,7 @@ def test_a_second_run_does_nothing_and_blank_pictures_cost_themselves(street: St
     assert 0 < found.wrong.sum() <= 0.01 * found.coloured.sum()
 
 
+@pytest.mark.slow
 def test_without_the_section_nothing_is_made(street: Street) -> None:
     none = changed(street.survey, {"colours": None})
     session = street.run(none)

@@ -33,6 +33,7 @@ def photographed(tmp_path_factory: pytest.TempPathFactory) -> Session:
     return session
 
 
+@pytest.mark.slow
 def test_painted_corners_lie_where_they_are(photographed: Session) -> None:
     photo = Path(photographed.store.path("products/orthophoto/orthophoto.vrt"))
     shifts = corner_shifts_m(photo, truth.load(photographed.survey.folder))

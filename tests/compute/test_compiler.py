@@ -25,6 +25,7 @@ print(sum(slope_weights.stats.cache_misses.values()), weights @ times**2)
 """
 
 
+@pytest.mark.slow
 def test_one_process_compiles_and_the_others_load(tmp_path: Path) -> None:
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     command = [sys.executable, "-c"]
@@ -132,6 +133,7 @@ print(*(own.fndesc.mangled_name for variant in (twice, thrice) for own in varian
 """
 
 
+@pytest.mark.slow
 def test_variants_of_one_name_that_two_processes_compile_have_names_of_their_own(tmp_path: Path) -> None:
     """The linker takes the first of two functions of one name: a third process would call it for the other."""
     script = tmp_path / "variants.py"
@@ -163,6 +165,7 @@ with progress.reporting_compilation(Lines()):
 """
 
 
+@pytest.mark.slow
 def test_a_run_tells_what_is_compiled(tmp_path: Path) -> None:
     (tmp_path / "parts.py").write_text(PARTS, encoding="utf-8")
     (tmp_path / "told.py").write_text(TOLD, encoding="utf-8")
@@ -197,6 +200,7 @@ CHAIN = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changed", CHAIN)
 def test_a_changed_kernel_changes_the_folder_of_all_that_import_it(tmp_path: Path, changed: str) -> None:
     """Whatever the form of the import and the depth of the folder; no other kernel is compiled again."""

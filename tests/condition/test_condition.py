@@ -68,6 +68,7 @@ def again(surveyed: RoughSurvey, folder: Path) -> Session:
     return RoughSurvey(copy / surveyed.file.name).session("store", section_m=50.0)
 
 
+@pytest.mark.slow
 def test_values_are_those_of_the_truth(surveyed: RoughSurvey) -> None:
     session = surveyed.session("store", section_m=50.0)
     held, long = (
@@ -108,6 +109,7 @@ def test_values_are_those_of_the_truth(surveyed: RoughSurvey) -> None:
     assert held["section", "grade_percent"][:, 0] == pytest.approx(held["section", "grade_percent"][:, 1], abs=0.02)
 
 
+@pytest.mark.slow
 def test_steps_are_as_high_as_those_of_the_truth(surveyed: RoughSurvey) -> None:
     session = surveyed.session("store", section_m=50.0)
     config = ConditionConfig.stated(session.survey)
@@ -127,6 +129,7 @@ def test_steps_are_as_high_as_those_of_the_truth(surveyed: RoughSurvey) -> None:
         assert [height for _, height in found[:2]] == pytest.approx([STEP_MM, -STEP_MM], abs=1.0)  # so may heights
 
 
+@pytest.mark.slow
 def test_sections_of_ten_metres_have_a_roughness(surveyed: RoughSurvey) -> None:
     """Their mean is that of the section which they part."""
     session = surveyed.session("store", section_m=50.0)
@@ -143,6 +146,7 @@ def test_sections_of_ten_metres_have_a_roughness(surveyed: RoughSurvey) -> None:
     assert found[5] == pytest.approx(found[1], rel=2e-3)
 
 
+@pytest.mark.slow
 def test_the_section_table_is_filed_in_three_forms(surveyed: RoughSurvey) -> None:
     folder = surveyed.file.parent / "store" / "survey=rough" / "products" / "condition_sections"
     table = geopandas.read_parquet(folder / "condition_sections.parquet")
@@ -174,6 +178,7 @@ def test_the_section_table_is_filed_in_three_forms(surveyed: RoughSurvey) -> Non
     assert own["share_measured"].iloc[1] == 1.0
 
 
+@pytest.mark.slow
 def test_tiles_hold_what_lies_in_them(surveyed: RoughSurvey) -> None:
     store = surveyed.session("store").store
     tiles = geopandas.read_parquet(store.path("products/condition_tiles/condition_tiles.parquet"))
@@ -193,6 +198,7 @@ def test_tiles_hold_what_lies_in_them(surveyed: RoughSurvey) -> None:
     assert tiles["mri_max_m_per_km"].max() == rough["b"][0].as_py()
 
 
+@pytest.mark.slow
 def test_sql_sees_the_tables(surveyed: RoughSurvey) -> None:
     store = surveyed.session("store").store
     worst = query(store, "SELECT lane, max(mri_m_per_km) AS worst FROM condition_sections GROUP BY lane ORDER BY lane")
@@ -212,6 +218,7 @@ def digests(session: Session) -> dict[str, str]:
     return {r.unit: r.digest for r in session.manifest.all() if r.product in own}
 
 
+@pytest.mark.slow
 def test_the_ten_questions_have_answers(surveyed: RoughSurvey) -> None:
     page = (Path(__file__).parents[2] / "docs" / "queries.md").read_text(encoding="utf-8")
     asked = re.findall(r"^```sql\n(.*?)^```\n\n```\n(.*?)\n", page, flags=re.MULTILINE | re.DOTALL)
@@ -221,6 +228,7 @@ def test_the_ten_questions_have_answers(surveyed: RoughSurvey) -> None:
         assert query(store, statement).column_names == heading.split(), statement
 
 
+@pytest.mark.slow
 def test_a_second_run_does_nothing_and_stretches_change_no_bit(
     surveyed: RoughSurvey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -242,6 +250,7 @@ def test_a_second_run_does_nothing_and_stretches_change_no_bit(
     assert after == before
 
 
+@pytest.mark.slow
 def test_heights_do_not_depend_on_the_stretch(surveyed: RoughSurvey) -> None:
     session = surveyed.session("store", section_m=50.0)
     config = ConditionConfig.stated(session.survey)
@@ -255,6 +264,7 @@ def test_heights_do_not_depend_on_the_stretch(surveyed: RoughSurvey) -> None:
     np.testing.assert_array_equal(whole.paths["left"].values[own], part.paths["left"].values)
 
 
+@pytest.mark.slow
 def test_only_what_depends_on_a_tile_is_computed_again(surveyed: RoughSurvey, tmp_path: Path) -> None:
     session = again(surveyed, tmp_path)
     work = plan_condition(session)
@@ -291,6 +301,7 @@ class Highest(ConditionIndex):
             yield Value("highest_m", "section", a, b, float(known.max()) if known.size else np.nan, np.nan, 1.0)
 
 
+@pytest.mark.slow
 def test_a_new_index_leaves_the_others_current(
     surveyed: RoughSurvey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -313,6 +324,7 @@ def entry_of(kind: type) -> str:
     return "roadscan.condition.index:ConditionIndex" if kind is Highest else name_of(kind)
 
 
+@pytest.mark.slow
 def test_cracks_are_counted_by_section(surveyed: RoughSurvey, tmp_path: Path) -> None:
     session = again(surveyed, tmp_path)
     group = next(g for g in plan_condition(session).groups if g.lane.name == "2")
@@ -349,6 +361,7 @@ def test_cracks_are_counted_by_section(surveyed: RoughSurvey, tmp_path: Path) ->
     assert own["cracked_wheel_path_percent"].tolist() == pytest.approx(wanted, abs=0.6)
 
 
+@pytest.mark.slow
 def test_heights_of_the_reconstructed_surface(surveyed: RoughSurvey, tmp_path: Path) -> None:
     session = again(surveyed, tmp_path)
     values = session.survey.config.model_dump() | {"surface": {"method": "cells", "sigma_m": 0.0005, "smooth": False}}
@@ -371,6 +384,7 @@ def test_heights_of_the_reconstructed_surface(surveyed: RoughSurvey, tmp_path: P
     assert np.isnan(known[:, 2]).all()  # how a smoothed surface scatters is not how it errs
 
 
+@pytest.mark.slow
 def test_a_layer_that_is_not_there_is_told_before_the_run(surveyed: RoughSurvey) -> None:
     session = surveyed.session("store", layer="lines.gpkg")
     (error,) = stage_named("condition").check(session.survey)
@@ -378,6 +392,7 @@ def test_a_layer_that_is_not_there_is_told_before_the_run(surveyed: RoughSurvey)
     assert stage_named("condition").check(surveyed.session("store").survey) == []
 
 
+@pytest.mark.slow
 def test_without_its_section_there_is_no_condition(surveyed: RoughSurvey, tmp_path: Path) -> None:
     session = again(surveyed, tmp_path)
     values = session.survey.config.model_dump()
@@ -389,6 +404,7 @@ def test_without_its_section_there_is_no_condition(surveyed: RoughSurvey, tmp_pa
     assert not session.store.files("tables/profiles_longitudinal")
 
 
+@pytest.mark.slow
 def test_a_second_survey_tells_what_changed_and_what_did_not(surveyed: RoughSurvey, tmp_path: Path) -> None:
     """Ruts 6 mm deeper, the same unevenness, driven slower: against the truth of both scenes."""
     slab = {"station_m": 60.0, "offset_m": 1.75, "length_m": 12.0, "width_m": 3.5, "height_m": -1e-3 * STEP_MM}
@@ -426,6 +442,7 @@ def test_a_second_survey_tells_what_changed_and_what_did_not(surveyed: RoughSurv
         changes.write(tmp_path / "changes.xlsx")
 
 
+@pytest.mark.slow
 def test_patches_that_have_lost_stones_are_outlined_on_the_map(surveyed: RoughSurvey, tmp_path: Path) -> None:
     """Texture of 0.8 mm, and of 1.6 mm over 2.8 × 0.8 m in the right wheel path."""
     session = again(surveyed, tmp_path)
@@ -465,6 +482,7 @@ def test_patches_that_have_lost_stones_are_outlined_on_the_map(surveyed: RoughSu
     assert own["ravelling_loss_cm3_per_m2"].tolist()[1] == pytest.approx(400.0 * 2.24 / (50.0 * 3.4), rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.witness("severe_step")
 @pytest.mark.parametrize(("kerb_m", "done"), [(0.15, "is kept"), (0.8, "is left out")])
 def test_a_kerb_that_is_crossed_is_kept_in_the_roughness_and_doubted(

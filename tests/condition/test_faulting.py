@@ -64,6 +64,7 @@ def values(folder: Path, **condition: float) -> pd.DataFrame:
     ).to_pandas()
 
 
+@pytest.mark.slow
 def test_every_joint_of_the_spacing_counts_in_the_mean_with_its_sign(slabs: Path) -> None:
     """Faults of LTPP's sign: positive where the approach slab is higher."""
     found = values(slabs, joint_spacing_m=SLAB_M, section_m=200.0)
@@ -84,6 +85,7 @@ def test_every_joint_of_the_spacing_counts_in_the_mean_with_its_sign(slabs: Path
     assert joints["value"] >= 24 and "by spacing" in joints["reason"]
 
 
+@pytest.mark.slow
 def test_without_a_spacing_only_steps_are_joints_and_this_is_told(slabs: Path) -> None:
     found = values(slabs, section_m=200.0)
     steps = found[found["quantity"] == "step_left_mm"]["value"].to_numpy()

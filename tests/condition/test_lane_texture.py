@@ -82,6 +82,7 @@ def test_nothing_is_found_where_no_stones_are_lost(
     assert found.patches == ()
 
 
+@pytest.mark.slow
 def test_where_most_has_lost_stones_the_lane_says_what_is_sound() -> None:
     """Stones are lost from border to border but for 0.6 m in the middle, along a section of 6 m: 70 % of it."""
     both = [PATCH | {"offset_m": o, "length_m": 12.0, "width_m": 0.7, "lost_share": 0.3, "depth_m": 0.006}
@@ -195,6 +196,7 @@ def test_of_two_lines_the_inner_one_is_that_of_the_lane() -> None:
     assert painted_line(np.full(away.size, 70.0), np.full(away.size, 70.0), away) is None
 
 
+@pytest.mark.slow
 def test_a_rut_that_deepens_does_not_change_the_texture() -> None:
     """Cells of 50 mm: the slope of a rut's sides scatters their readings, and is no texture."""
     found = {}

@@ -49,6 +49,7 @@ def test_published_segments_by_the_command(recordings: Path) -> None:
     assert "one of m, cm" in refused("iri", file, "--x-unit", "m", "--height-unit", "furlong")
 
 
+@pytest.mark.slow
 def test_the_figures_of_captif_by_the_command(recordings: Path, tmp_path: Path) -> None:
     file = tmp_path / "station_0.dat"
     file.write_bytes(gzip.decompress((recordings / "texture" / "station_0.dat.gz").read_bytes()))

@@ -45,6 +45,7 @@ def session_of(made: RoughSurvey, **edges: object) -> Session:
     return made.session("store", section_m=10.0, road_edges={"reach_m": 1.5, **edges})
 
 
+@pytest.mark.slow
 def test_the_table_of_edges_and_the_surface_are_those_of_the_road(surveyed: RoughSurvey) -> None:
     store = session_of(surveyed).store
     rows = query(store, "SELECT * FROM road_edge_offsets WHERE station_m BETWEEN 12 AND 38").to_pandas()
@@ -66,6 +67,7 @@ def test_the_table_of_edges_and_the_surface_are_those_of_the_road(surveyed: Roug
     assert layer.area.to_numpy() == pytest.approx(layer["area_m2"].to_numpy())
 
 
+@pytest.mark.slow
 def test_widths_and_drops_are_values_of_sections(surveyed: RoughSurvey) -> None:
     store = session_of(surveyed).store
     found = query(
@@ -85,6 +87,7 @@ def test_widths_and_drops_are_values_of_sections(surveyed: RoughSurvey) -> None:
     assert table["road_width_mean_m"].notna().sum() >= 4
 
 
+@pytest.mark.slow
 def test_heights_beyond_an_edge_are_no_part_of_a_cross_section(surveyed: RoughSurvey) -> None:
     """A lane that is stated 0.4 m wider than the road: what lies behind the kerb is left out."""
     values = {"lanes": [{"name": "2", "offset_m": 1.95, "width_m": 3.9}], "road_edges": {"reach_m": 1.5}}
@@ -100,6 +103,7 @@ def test_heights_beyond_an_edge_are_no_part_of_a_cross_section(surveyed: RoughSu
     assert np.isfinite(c.height_m[inner][:, np.abs(c.offset_m) < 1.4]).mean() > 0.99
 
 
+@pytest.mark.slow
 def test_the_same_bits_again_and_nothing_to_do_the_second_time(
     surveyed: RoughSurvey, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -117,6 +121,7 @@ def test_the_same_bits_again_and_nothing_to_do_the_second_time(
     assert {name for g in plan_condition(session).due_groups for name, _ in g.indices} == set()
 
 
+@pytest.mark.slow
 def test_polygons_of_the_survey_file_are_the_edges(surveyed: RoughSurvey, tmp_path: Path) -> None:
     from roadscan.simulate import truth
 

@@ -62,6 +62,7 @@ def test_every_patch_is_found_and_no_car(cars: list[tuple[float, float, float]])
     assert fates.count("off_the_surface") == (2 if cars else 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("markings", [True, False])
 def test_nothing_on_a_sound_road(markings: bool) -> None:
     assert found(Section(markings=markings)).regions == []
@@ -106,6 +107,7 @@ def test_order_of_points_changes_no_bit() -> None:
     assert [r.severity for r in one.regions] == [r.severity for r in other.regions]
 
 
+@pytest.mark.slow
 def test_density_and_height_leave_regions_out() -> None:
     section = Section(patches=[TRENCH, PATCH])
     fates = {one.fate for one in found(section, RoughnessRegionsConfig(least_density_per_m2=2000.0)).clusters}

@@ -50,6 +50,7 @@ def read(session: Session) -> geopandas.GeoDataFrame:
     return geopandas.GeoDataFrame(pd.concat(parts, ignore_index=True))
 
 
+@pytest.mark.slow
 def test_regions_are_the_patches_that_were_laid(surveyed: RoughSurvey) -> None:
     """The last patch lies on the border of two sections, which cut it in two."""
     session = opened(surveyed)
@@ -65,6 +66,7 @@ def test_regions_are_the_patches_that_were_laid(surveyed: RoughSurvey) -> None:
     assert np.allclose(table.geometry.area, areas, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_tables_and_picture(surveyed: RoughSurvey) -> None:
     session = opened(surveyed)
     sections = query(session.store, "SELECT * FROM roughness_sections ORDER BY station_from_m").to_pandas()
@@ -78,6 +80,7 @@ def test_tables_and_picture(surveyed: RoughSurvey) -> None:
     assert stage_named("condition").state(session).stale == 0
 
 
+@pytest.mark.slow
 def test_the_pieces_change_no_bit_and_settings_make_them_due(
     surveyed: RoughSurvey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -63,6 +63,7 @@ def errors_within_the_bar(found: pd.DataFrame) -> None:
     assert (found["sigma_ride_number"] < 0.4).all()
 
 
+@pytest.mark.slow
 def test_a_smooth_road_with_wrong_and_lost_readings(tmp_path: Path) -> None:
     errors_within_the_bar(sections(tmp_path / "survey", 0.8, 31))
 

@@ -105,6 +105,7 @@ def kerb(x: np.ndarray, depth_m: float) -> np.ndarray:
     return np.where(x > 149.9, min(depth_m, 0.2), 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [pothole, kerb])
 def test_a_severe_place_grows_with_its_depth_and_is_listed(shape: Any, tmp_path: Path) -> None:
     """From 20 to 300 mm: no cliff, and from 0.1 m on between neighbours the note says that a step was kept."""

@@ -84,6 +84,7 @@ def test_the_readme_lists_every_extra_and_first_those_that_make_installs() -> No
     assert set(listed[:5]) == set(installed.split("$(comma)"))
 
 
+@pytest.mark.slow
 def test_every_module_can_be_imported_without_extras() -> None:
     outcome = subprocess.run(
         [sys.executable, "-c", BLOCKED + IMPORT_ALL], cwd=REPOSITORY, capture_output=True, text=True, check=False
@@ -116,6 +117,7 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return simulate(scene, tmp_path_factory.mktemp("extras") / "street").survey_file
 
 
+@pytest.mark.slow
 def test_a_run_without_extras_makes_all_but_pictures_of_figures(street: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     picture = street.parent / "store" / "survey=street" / "products" / "adjustment" / "adjustment.png"
     command = ["run", str(street), "--workers", "0"]

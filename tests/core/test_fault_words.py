@@ -59,6 +59,7 @@ def _fields() -> list[tuple[type[Strict], str]]:
     return list(found.values())
 
 
+@pytest.mark.slow
 def test_every_fault_of_every_model_is_in_words() -> None:
     """All kinds of values for each key: what pydantic says of them is told in other words."""
     kinds: set[str] = set()

@@ -26,6 +26,7 @@ ANGLE = st.floats(-np.pi, np.pi)
 PITCH = st.floats(-1.5, 1.5)
 
 
+@pytest.mark.slow
 @given(roll=ANGLE, pitch=PITCH, heading=ANGLE)
 @settings(max_examples=100, deadline=None)
 def test_rotation_agrees_with_scipy_and_returns(roll: float, pitch: float, heading: float) -> None:

@@ -93,6 +93,7 @@ for index in Path(sys.argv[1]).rglob("*.nbi"):
 """
 
 
+@pytest.mark.slow
 def test_a_poisoned_cache_is_not_run(tmp_path: Path) -> None:
     """What another user put there would be executed: it is, where the folder is trusted, so the test bites."""
     base = tmp_path / "shared"
@@ -116,6 +117,7 @@ def test_a_poisoned_cache_is_not_run(tmp_path: Path) -> None:
     assert (base / "owned").exists()
 
 
+@pytest.mark.slow
 def test_the_command_line_says_it_in_one_line(tmp_path: Path) -> None:
     folder = tmp_path / "cache"
     folder.mkdir(mode=0o777)

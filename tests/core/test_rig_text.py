@@ -141,6 +141,7 @@ def test_the_file_is_replaced_at_once_or_stays(tmp_path: Path, monkeypatch: pyte
 COMMENT = st.text(st.characters(codec="utf-8", exclude_categories=["Cc", "Cs"]), max_size=20)
 
 
+@pytest.mark.slow
 @given(
     name=st.text(st.characters(codec="utf-8", exclude_categories=["Cc", "Cs"]), min_size=1, max_size=8),
     comments=st.lists(COMMENT, min_size=4, max_size=4),

@@ -78,6 +78,7 @@ def planned(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     return survey, plan_survey(survey, store)
 
 
+@pytest.mark.slow
 def test_the_drive_is_as_hard_as_claimed(planned: tuple[Survey, SurveyPlan]) -> None:
     survey, _ = planned
     _, position, attitude = true_poses(survey.folder, "run-1")
@@ -88,6 +89,7 @@ def test_the_drive_is_as_hard_as_claimed(planned: tuple[Survey, SurveyPlan]) -> 
     assert roll.min() < -9.0 and roll.max() > 9.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensor", list(BARS_M))
 def test_every_reading_lies_where_its_beam_hit(planned: tuple[Survey, SurveyPlan], sensor: str) -> None:
     survey, plan = planned

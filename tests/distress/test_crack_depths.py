@@ -61,6 +61,7 @@ def depths(window: HeightWindow) -> tuple[float, float]:
     return crack.depth_mean_m, crack.depth_max_m
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("width_m", "depth_m", "kept", "wrong"),
     [(0.005, 0.003, 0.95, 0.0), (0.005, 0.008, 0.95, WRONG), (0.004, 0.010, 0.95, 0.0), (0.005, 0.008, 0.3, 0.0)],

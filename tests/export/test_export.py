@@ -62,6 +62,7 @@ def same(one: pa.Table, other: pa.Table, column: str) -> bool:
     return bool(np.array_equal(left, right))
 
 
+@pytest.mark.slow
 def test_psi_keeps_every_reading(survey: Survey, tmp_path: Path) -> None:
     run, sensor = profiler(survey)
     made = export_psi(survey, store_of(survey), run, sensor, tmp_path / "psi", PsiSettings(5.0))
@@ -84,6 +85,7 @@ def test_psi_keeps_every_reading(survey: Survey, tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.slow
 def test_psi_headers_say_where_and_how_fast(survey: Survey, tmp_path: Path) -> None:
     run, sensor = profiler(survey)
     made = export_psi(survey, store_of(survey), run, sensor, tmp_path / "psi", PsiSettings(4.0))
@@ -107,6 +109,7 @@ def test_psi_headers_say_where_and_how_fast(survey: Survey, tmp_path: Path) -> N
         assert abs((head.heading_deg - course + 180) % 360 - 180) < 3.0
 
 
+@pytest.mark.slow
 def test_opencrg_equals_the_truth(survey: Survey, tmp_path: Path) -> None:
     """A node's height is the mean of its cell: within slope × cell and texture of the truth at the node."""
     run, sensor = profiler(survey)
@@ -201,6 +204,7 @@ def test_holes() -> None:
     assert inner_holes(heights) == 4 + 1
 
 
+@pytest.mark.slow
 def test_a_pass_of_nothing_and_wrong_names(survey: Survey, tmp_path: Path) -> None:
     run, sensor = profiler(survey)
     store = store_of(survey)
@@ -226,6 +230,7 @@ def test_a_pass_of_nothing_and_wrong_names(survey: Survey, tmp_path: Path) -> No
     assert sorted(p.name for p in tmp_path.iterdir()) == ["full"]  # nothing half-written stays
 
 
+@pytest.mark.slow
 def test_a_failure_leaves_nothing(survey: Survey, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     calls = iter([None] * 2)
 
@@ -239,6 +244,7 @@ def test_a_failure_leaves_nothing(survey: Survey, tmp_path: Path, monkeypatch: p
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_the_command(survey: Survey, tmp_path: Path) -> None:
     run, sensor = profiler(survey)
     file = str(survey.folder / "SURVEY.toml")

@@ -112,6 +112,7 @@ def opensfm_projections(folder: Path) -> dict[str, np.ndarray]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "read"),
     [("colmap", colmap_projections), ("colmap", colmaps_own_projections), ("opensfm", opensfm_projections)],

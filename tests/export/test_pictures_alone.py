@@ -72,6 +72,7 @@ def layer(file: Path) -> geopandas.GeoDataFrame:
     return geopandas.read_parquet(parquet)
 
 
+@pytest.mark.slow
 def test_footprints_lie_on_a_plane_where_the_rig_states_its_height(alone: Path, tmp_path: Path) -> None:
     rows = layer(alone)
     assert len(rows) == len(FEW) and rows["without_pose"].isna().all() and rows["without_footprint"].isna().all()
@@ -151,6 +152,7 @@ def opensfm_residuals(folder: Path) -> Iterator[tuple[str, float, float, float, 
         yield shot_name.rsplit("/", 1)[-1], u, v, left[0] * size, left[1] * size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "read"), [("colmap", colmap_residuals), ("opensfm", opensfm_residuals)])
 def test_tracks_are_those_that_the_adjustment_kept(
     alone: Path, residuals: pd.DataFrame, tmp_path: Path, kind: str, read
@@ -168,6 +170,7 @@ def test_tracks_are_those_that_the_adjustment_kept(
     assert both[["du", "dv"]].abs().to_numpy().max() > 0.3  # there is something to be equal to
 
 
+@pytest.mark.slow
 def test_some_pictures_have_the_tracks_that_they_share(alone: Path, tmp_path: Path) -> None:
     output = told("export", "colmap", str(alone), "--out", str(tmp_path / "out"), "--camera", "left")
     assert "copies them so" in output
@@ -176,6 +179,7 @@ def test_some_pictures_have_the_tracks_that_they_share(alone: Path, tmp_path: Pa
     assert all((tmp_path / "copies" / name).is_file() for name in names) and len(names) == len(FEW)
 
 
+@pytest.mark.slow
 def test_names_of_two_logs_do_not_overwrite_one_another(alone: Path, tmp_path: Path) -> None:
     """The first two pictures become a log of their own, which calls one of them as another of the first log."""
     copy = tmp_path / "two"

@@ -84,6 +84,7 @@ def rows(fleet: Path) -> pd.DataFrame:
     return pd.read_parquet(fleet / "fleet" / "surveys.parquet").set_index("survey")
 
 
+@pytest.mark.slow
 def test_a_row_says_where_when_and_how_well(fleet: Path) -> None:
     """Against the raw trajectory, the GeoTIFFs of the tiles and the section table, each read by another library."""
     table = rows(fleet)
@@ -115,6 +116,7 @@ def test_a_row_says_where_when_and_how_well(fleet: Path) -> None:
     assert table["mri_m_per_km"]["south-2026"] > 1.5 * table["mri_m_per_km"]["north-2025"]
 
 
+@pytest.mark.slow
 def test_a_networks_yearly_condition_is_one_query(fleet: Path) -> None:
     asked = cli("sql", "--fleet", str(fleet), "--json", YEARLY)
     assert asked.exit_code == 0, asked.output
@@ -126,6 +128,7 @@ def test_a_networks_yearly_condition_is_one_query(fleet: Path) -> None:
     assert list(found) == [2025, 2026]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "table", ["scans", "trajectory", "tiles", "condition_sections", "cells", "run_history", "outputs"]
 )
@@ -140,6 +143,7 @@ def test_a_table_has_the_rows_of_all_surveys(fleet: Path, table: str) -> None:
     assert {row["survey"]: row["n"] for row in ask_fleet(str(fleet), statement).to_pylist()} == alone
 
 
+@pytest.mark.slow
 def test_a_span_of_time_opens_the_files_of_its_survey(fleet: Path) -> None:
     (ends,) = ask_fleet(
         str(fleet), "SELECT min(epoch_gps_ns) AS a, max(epoch_gps_ns) AS b FROM scans WHERE survey LIKE 'south%'"
@@ -148,6 +152,7 @@ def test_a_span_of_time_opens_the_files_of_its_survey(fleet: Path) -> None:
     assert found.column("survey").to_pylist() == ["south-2026"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "statement",
     [
@@ -166,6 +171,7 @@ def test_a_statement_stays_within_the_stores(fleet: Path, statement: str) -> Non
     assert not Path("/tmp/roadscan-fleet.csv").exists() and not (root(fleet, "north-2025") / "x.csv").exists()
 
 
+@pytest.mark.slow
 def test_other_programs_open_the_catalogue(fleet: Path) -> None:
     """Spark is not at hand: of the types that Parquet has, plain ones alone are in the file, which all readers know."""
     file = fleet / "fleet" / "surveys.parquet"
@@ -206,6 +212,7 @@ class Tables(HTMLParser):
             self.of[self._section][-1][-1] += data
 
 
+@pytest.mark.slow
 def test_the_page_says_the_same_as_the_catalogue(fleet: Path, tmp_path: Path) -> None:
     told = Tables((fleet / "fleet/index.html").read_text()).of
     asked = list(csv.DictReader(io.StringIO(cli("sql", "--fleet", str(fleet), "--csv", YEARLY).output)))
@@ -226,6 +233,7 @@ def test_the_page_says_the_same_as_the_catalogue(fleet: Path, tmp_path: Path) ->
     assert wrong["south-2026"][1] == "not run" and len(wrong) == 2 and "<b>" not in page
 
 
+@pytest.mark.slow
 def test_only_what_changed_is_made_anew(fleet: Path, tmp_path: Path) -> None:
     folder = tmp_path / "fleet"
     shutil.copytree(fleet, folder)
@@ -248,6 +256,7 @@ def test_only_what_changed_is_made_anew(fleet: Path, tmp_path: Path) -> None:
     assert make_catalogue(str(folder)).made == 1
 
 
+@pytest.mark.slow
 def test_what_is_wrong_with_a_survey_is_said(fleet: Path, tmp_path: Path) -> None:
     folder = tmp_path / "fleet"
     shutil.copytree(fleet, folder, ignore=shutil.ignore_patterns("fleet"))
@@ -272,6 +281,7 @@ def test_what_is_wrong_with_a_survey_is_said(fleet: Path, tmp_path: Path) -> Non
     assert "no survey of 1 has the table 'poles'" in str(unknown.exception)
 
 
+@pytest.mark.slow
 def test_stores_without_survey_files_in_a_bucket(fleet: Path) -> None:
     bucket = fsspec.filesystem("memory")
     try:

@@ -67,6 +67,7 @@ def test_each_failure_is_told_once() -> None:
     assert [who(happened("Crashed", flow)) for flow in ("survey", "arrival", "watch")] == [["run crashed"]] * 3
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("prefect_api")
 def test_without_an_address_no_automation_sends_messages() -> None:
     """Those that did are removed, and the address of before is not readable."""

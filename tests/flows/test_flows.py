@@ -79,6 +79,7 @@ def recorded(client: SyncPrefectClient, state: State[Any]) -> FlowRun:
     return client.read_flow_run(state.state_details.flow_run_id)
 
 
+@pytest.mark.slow
 def test_survey_makes_every_product(survey_file: Path, simulated: SimulatedSurvey, client: SyncPrefectClient) -> None:
     state = survey(str(survey_file), workers=0, return_state=True)
     run = recorded(client, state)
@@ -99,6 +100,7 @@ def test_survey_makes_every_product(survey_file: Path, simulated: SimulatedSurve
         assert count.read(1, masked=True).sum() == simulated.readings
 
 
+@pytest.mark.slow
 def test_second_run_does_nothing(rerun: Path) -> None:
     before = {f: written(rerun, f) for f in ("tables", "tiles", "products")}
     assert all(before.values())
@@ -116,6 +118,7 @@ DAY = {"start": "2026-05-04T00:00:00Z", "end": "2026-05-05T00:00:00Z"}
 OTHER_DAY = {"start": "2026-05-05T00:00:00Z", "end": "2026-05-06T00:00:00Z"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "choice",
     [{"tiles": [TILE]}, {"box_m": (691002.0, 5335002.0, 691003.0, 5335003.0)}, DAY],
@@ -130,6 +133,7 @@ def test_reprocess_writes_the_same_bytes_again(rerun: Path, choice: dict[str, An
     assert {n for n in before if after[n] != before[n]} == chosen
 
 
+@pytest.mark.slow
 def test_damaged_data_fails_the_run_and_names_the_tiles(rerun: Path, client: SyncPrefectClient) -> None:
     (damaged,) = (p for n, p in files(rerun, "tables/scans").items() if "profiler_right" in n)
     damaged.write_bytes(bytes(damaged.stat().st_size))
@@ -149,6 +153,7 @@ def test_damaged_data_fails_the_run_and_names_the_tiles(rerun: Path, client: Syn
         state.result()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("choice", "error", "words"),
     [
@@ -167,6 +172,7 @@ def test_a_choice_that_cannot_be_met_fails(
     assert written(rerun, "tiles") == before
 
 
+@pytest.mark.slow
 def test_an_upload_without_one_log_fails_and_names_it(survey_file: Path) -> None:
     missing = survey_file.parent / "raw" / "run-1" / "profiler_left.parquet"
     log = missing.read_bytes()
@@ -177,6 +183,7 @@ def test_an_upload_without_one_log_fails_and_names_it(survey_file: Path) -> None
     assert survey(str(survey_file), workers=0)["raw_bytes_read"] > 0
 
 
+@pytest.mark.slow
 def test_an_api_that_does_not_answer(survey_file: Path) -> None:
     with socket.socket() as silent:  # bound, but nobody listens
         silent.bind(("127.0.0.1", 0))

@@ -349,6 +349,7 @@ def sample(path: Path) -> Path:
 # --- the recording ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_recording_against_plain_python(recordings: Path) -> None:
     """7,374 scans of 180 readings, every digit of them, their stamps and poses."""
     path = recordings / "lms" / "aces.clf.bz2"

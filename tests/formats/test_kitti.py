@@ -186,6 +186,7 @@ def positions(rows: pa.RecordBatch) -> np.ndarray:
     return np.stack([rows.column(f"{a}_sensor_m").to_numpy().astype(float) for a in "xyz"], axis=-1)
 
 
+@pytest.mark.slow
 def test_every_record_is_read_or_rejected(turned: Readings, drive: Path) -> None:
     records = sum(p.stat().st_size for p in drive.rglob("*.bin")) // 16
     assert records == 6_317_433
@@ -195,6 +196,7 @@ def test_every_record_is_read_or_rejected(turned: Readings, drive: Path) -> None
     assert np.unique(turned["sweep"]).tolist() == list(range(0, 154, 3))
 
 
+@pytest.mark.slow
 def test_sweeps_tell_the_laser_of_each_return(turned: Readings) -> None:
     """The lasers of an HDL-64E point 2° up to 24.8° down (its manual), from places 0.1 m apart: ± 1.2° at 5 m."""
     middles = []
@@ -222,6 +224,7 @@ def test_lasers_that_rise_get_no_number(tmp_path: Path, order: int, told: bool) 
     assert bool(log.findings) is not told
 
 
+@pytest.mark.slow
 def test_labelled_boxes_hold_returns(turned: Readings, recordings: Path) -> None:
     """The recording's README: 98 % of boxes within 40 m hold more than 20 returns, median 334 (every 15th scan)."""
     boxes = np.genfromtxt(
@@ -236,6 +239,7 @@ def test_labelled_boxes_hold_returns(turned: Readings, recordings: Path) -> None
     assert np.mean(np.array(counts) > 20) == pytest.approx(0.98, abs=0.02)
 
 
+@pytest.mark.slow
 def test_the_head_turns_clockwise_and_sweeps_are_not_compensated(
     turned: Readings, drive: Path, recordings: Path
 ) -> None:

@@ -431,6 +431,7 @@ def test_what_another_library_writes_is_read(tmp_path: Path) -> None:
     assert log.epochs[0] == at("2003-02-01T10:15:30") + 250_000_000
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(
     latitude=st.floats(-90, 90),

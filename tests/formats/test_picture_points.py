@@ -84,6 +84,7 @@ def test_the_places_of_berlin(recordings: Path) -> None:
     assert seen == {("0", "02.jpg"), ("0", "03.jpg"), ("1", "02.jpg"), ("1", "01.jpg"), ("3", "02.jpg")}
 
 
+@pytest.mark.slow
 def test_the_points_of_berlin_fit_the_pictures(recordings: Path) -> None:
     """OpenCV orients the pictures to each other (SIFT, essential matrix, focal length of their EXIF, no distortion).
 

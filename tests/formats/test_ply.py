@@ -124,6 +124,7 @@ def test_text_that_the_declared_type_cannot_hold(tmp_path: Path, lists: bool) ->
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coding", CODINGS)
 def test_the_twin_of_a_las_file(tmp_path: Path, recordings: Path, coding: str) -> None:
     las = tmp_path / "strips.las"
@@ -257,6 +258,7 @@ def test_claims_are_held_against_the_file(tmp_path: Path) -> None:
     assert read("ply", written(tmp_path, top), NOON, crs="local").rejected == 3
 
 
+@pytest.mark.slow
 def test_lists_of_changing_length_take_linear_time(tmp_path: Path) -> None:
     count = 60_000
     top = head("binary_little_endian", f"element vertex {count}", "property list uchar uchar a", *XYZ)

@@ -124,6 +124,7 @@ def quay(recordings: Path, tmp_path: Path) -> Path:
 # --- recordings ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mode", "plane_m", "up_m"), [("static", 0.002, 0.004), ("kinematic", 0.035, 0.09)])
 def test_the_recorded_rover_through_a_survey(quay: Path, mode: str, plane_m: float, up_m: float) -> None:
     """Each epoch; the last one, of five satellites, is the worst of the kinematic solution."""
@@ -143,6 +144,7 @@ def test_the_recorded_rover_through_a_survey(quay: Path, mode: str, plane_m: flo
     assert "known: one/gnss" in again.output and "read:" not in again.output
 
 
+@pytest.mark.slow
 def test_the_recorded_rover_through_the_command(quay: Path) -> None:
     out = quay / "out" / "rover.pos"
     words = ["--base", quay / BASE, "--base-position", ",".join(map(str, BASE_M)), "--base-crs", "EPSG:4978@2005.25"]
@@ -379,6 +381,7 @@ def test_the_section_is_for_logs_of_the_format(tmp_path: Path) -> None:
 # --- the page --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_pages_commands_print_what_it_shows(
     recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

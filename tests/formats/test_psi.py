@@ -143,6 +143,7 @@ texts = st.text(st.characters(codec="latin-1", exclude_characters="\0", exclude_
 singles = st.floats(-1e9, 1e9, width=32)
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     header=st.builds(
@@ -206,6 +207,7 @@ def test_a_file_cut_off_and_a_wrong_trailer(tmp_path: Path) -> None:
         read_psi(written(tmp_path, data + b"x"))
 
 
+@pytest.mark.slow
 def test_a_bomb_is_refused_before_memory_is_taken(tmp_path: Path) -> None:
     edge = 20_000
     bomb = zlib.compress(bytes(2 * edge * edge), 9)  # 800 MB of nothing in 0.8 MB

@@ -75,6 +75,7 @@ def test_a_bag_of_each_kind_gives_what_was_written(kind: str, tmp_path: Path) ->
         assert bag.topics["/imu"].rate_hz == pytest.approx(100.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ros1", "ros1-lz4", "mcap", "mcap-storage", "sqlite"])
 @pytest.mark.parametrize("share", [0.5, 0.97])
 def test_a_bag_cut_off_keeps_whole_chunks(kind: str, share: float, tmp_path: Path) -> None:
@@ -93,6 +94,7 @@ def test_a_bag_cut_off_keeps_whole_chunks(kind: str, share: float, tmp_path: Pat
         assert bag.topics["/imu"].count == len(messages)
 
 
+@pytest.mark.slow
 def test_a_damaged_chunk_costs_its_own_messages(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "bag", "ros1-bz2", _topics(20_000))
     expected = _raw(path)["/imu"]
@@ -178,6 +180,7 @@ def test_packets_of_real_bags(recordings: Path, name: str, topic: str, count: in
     assert hashlib.sha256(found[0].payload).digest() != hashlib.sha256(bytes(length)).digest()
 
 
+@pytest.mark.slow
 def test_an_mcap_without_chunks(tmp_path: Path) -> None:
     """As ROS 2 writes it with the preset `fastwrite`: the records of the chunks, at the top level, and no summary."""
     path = write_bag(tmp_path / "bag", "mcap", _topics(20_000))

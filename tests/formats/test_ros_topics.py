@@ -80,6 +80,7 @@ def _head(packed: Path, lines: int) -> bytes:
 # --- the same rows as the direct formats ------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_drive_of_a_bag_is_that_of_its_files(kind: str, recordings: Path, tmp_path: Path) -> None:
     """IMU and RTK positions of a real drive, written by rosbags."""

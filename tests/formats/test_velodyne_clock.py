@@ -118,6 +118,7 @@ def test_a_step_of_less_than_a_second_is_left_out_unless_it_is_locked(tmp_path: 
     assert "lidar_clock_step" in said(log)
 
 
+@pytest.mark.slow
 def test_a_step_in_a_long_capture_is_found_behind_its_beginning(tmp_path: Path) -> None:
     """The header has looked at 1,000 packets; the capture is looked through at the step."""
     packets = heard(600.0, 600.1) + piece(600.2, 600.2, 1_500) + heard(603.0, 7.9, NO_PPS) + piece(603.0, 8.0, 700)
@@ -186,6 +187,7 @@ def test_a_pause_of_the_capture_is_no_step(tmp_path: Path) -> None:
     assert (true_s(log).size, log.rejected, log.findings) == (200, 0, [])
 
 
+@pytest.mark.slow
 def test_stamps_that_drift_are_named(tmp_path: Path) -> None:
     packets = heard(600.0, 600.1) + piece(600.2, 600.2, 700)
     for k in range(1, 40):

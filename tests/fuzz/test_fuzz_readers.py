@@ -32,6 +32,7 @@ def test_every_format_is_fuzzed() -> None:
     assert set(FORMS) == set(log_formats()), "give a new format a sample in tests/fuzz/samples.py"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SAMPLES)
 def test_damaged_files(tmp_path: Path, name: str) -> None:
     sample = SAMPLES[name]
@@ -98,6 +99,7 @@ def test_damage_reaches_what_is_packed(tmp_path: Path) -> None:
     assert any("compressed" in text or "no text" in text for text in said)  # the packing itself
 
 
+@pytest.mark.slow
 def test_what_a_reader_must_not_do_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Losing a record, a crash, a hang, too much memory: each is a failure."""
     fuzzer = Fuzzer(_sample("sbet/plain"), tmp_path)

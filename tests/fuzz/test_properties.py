@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pyproj
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -158,6 +159,7 @@ def test_control_csv(points: list[tuple[str, float, float, float]]) -> None:
 WORDS = st.one_of(st.floats().map(repr), st.text("0123456789.,-+eExn_\"'# \r\x00aé", max_size=6), st.just(""))
 
 
+@pytest.mark.slow
 @settings(max_examples=120, deadline=None)
 @given(rows=st.lists(st.lists(WORDS, min_size=1, max_size=4), max_size=8), end=st.sampled_from(["\n", "\r\n", ""]))
 def test_a_line_of_text_is_read_or_rejected_on_its_own(rows: list[list[str]], end: str) -> None:

@@ -80,6 +80,7 @@ def profiles(geometry: ScanGeometry, noise_m: float, kerb_m: float, kerb_height_
     return np.array(ranges), np.array(kinds)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("geometry", "noise_m", "kerb_m"), [(SICK, 0.006, 2.6), (HEAD, 0.0003, 0.9)])
 def test_road_is_kept_and_others_are_rejected(geometry: ScanGeometry, noise_m: float, kerb_m: float) -> None:
     ranges, kinds = profiles(geometry, noise_m, kerb_m)

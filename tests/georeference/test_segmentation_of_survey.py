@@ -98,6 +98,7 @@ def hits_of(street: Simulated, sensor: str) -> tuple[np.ndarray, np.ndarray]:
     return road, met & ~road
 
 
+@pytest.mark.slow
 def test_road_is_kept_and_others_are_rejected(street: Simulated) -> None:
     others_of_all = 0
     for sensor in SENSORS:
@@ -112,6 +113,7 @@ def test_road_is_kept_and_others_are_rejected(street: Simulated) -> None:
     assert others_of_all > 10_000
 
 
+@pytest.mark.slow
 def test_every_reading_is_told_by_its_fate(street: Simulated) -> None:
     status = survey_status(Session(changed(Survey.load(street.survey_file), ON | CELLS), street.store("cells")))
     counts: dict[str, int] = dict.fromkeys(NAMES, 0)
@@ -127,6 +129,7 @@ def test_every_reading_is_told_by_its_fate(street: Simulated) -> None:
     assert status.is_complete
 
 
+@pytest.mark.slow
 def test_neither_points_nor_blocks_change_a_byte(street: Simulated) -> None:
     cells = outputs(street.store("cells"))
     assert cells
@@ -136,6 +139,7 @@ def test_neither_points_nor_blocks_change_a_byte(street: Simulated) -> None:
     assert {p: b for p, b in outputs(street.store("points")).items() if not p.startswith("tiles/las/")} == cells
 
 
+@pytest.mark.slow
 def test_marked_points_are_those_beside_the_road(street: Simulated) -> None:
     street.run("marked", **ON, filters__keep_marked=True, products__make=["geotiff", "tile_table", "las"])
     marked, plain = street.store("marked"), street.store("cells")
@@ -156,6 +160,7 @@ def test_marked_points_are_those_beside_the_road(street: Simulated) -> None:
     assert {p: b for p, b in ours.items() if not p.startswith("tiles/las/")} == theirs
 
 
+@pytest.mark.slow
 def test_only_settings_of_the_segmentation_make_tiles_stale(street: Simulated) -> None:
     def keys(**settings: Any) -> tuple[int, int]:
         survey = changed(Survey.load(street.survey_file), CELLS | settings)
@@ -176,6 +181,7 @@ def test_only_settings_of_the_segmentation_make_tiles_stale(street: Simulated) -
     assert keys_of_readings[0] == keys_of_readings[1]  # so footprints stay current
 
 
+@pytest.mark.slow
 def test_what_cannot_be_segmented_is_refused(street: Simulated) -> None:
     survey = Survey.load(street.survey_file)
     with pytest.raises(ConfigError, match=r"unknown sensor 'sik'.*did you mean 'sick'"):

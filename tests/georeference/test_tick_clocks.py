@@ -94,10 +94,12 @@ def size_ms(line: str, begin: str) -> float:
     return float(line.split(begin)[1].split(" ms", maxsplit=1)[0].replace(",", ""))
 
 
+@pytest.mark.slow
 def test_clocks_that_are_right_are_not_named(tmp_path: Path) -> None:
     assert told(tmp_path, np.zeros_like, np.zeros_like) == []
 
 
+@pytest.mark.slow
 @pytest.mark.witness("tick_clock")
 @pytest.mark.parametrize("size_s", [LATE_S, -LATE_S, 0.6])
 def test_a_late_head_is_named_with_its_offset(tmp_path: Path, size_s: float) -> None:
@@ -108,12 +110,14 @@ def test_a_late_head_is_named_with_its_offset(tmp_path: Path, size_s: float) -> 
     assert sigma_ms < 3.0
 
 
+@pytest.mark.slow
 def test_late_poses_are_named_since_both_heads_say_so(tmp_path: Path) -> None:
     (line,) = told(tmp_path, np.zeros_like, constant(LATE_S))
     assert "poses.csv: the clock of all 2 sensors is -" in line
     assert size_ms(line, "sensors is ") == pytest.approx(-1e3 * LATE_S, abs=1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size_s", [0.02, 2.0])
 def test_a_head_whose_clock_steps_is_named(tmp_path: Path, size_s: float) -> None:
     (line,) = told(tmp_path, step(size_s), np.zeros_like)
@@ -121,6 +125,7 @@ def test_a_head_whose_clock_steps_is_named(tmp_path: Path, size_s: float) -> Non
     assert size_ms(line, "poses by ") == pytest.approx(1e3 * size_s, rel=0.1)
 
 
+@pytest.mark.slow
 def test_poses_whose_clock_steps_are_named_once(tmp_path: Path) -> None:
     lines = told(tmp_path, np.zeros_like, step(0.5))
     assert len(lines) == 1

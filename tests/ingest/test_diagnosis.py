@@ -114,6 +114,7 @@ def without_rights() -> None:
             ctypes.CDLL(None).prctl(24, right, 0, 0, 0)  # PR_CAPBSET_DROP
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="rights are taken away by Linux's own call")
 def test_a_file_that_may_not_be_opened(tmp_path: Path) -> None:
     """Also one in a folder that may not be entered; a run says the same of both."""

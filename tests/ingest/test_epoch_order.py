@@ -151,6 +151,7 @@ def test_a_log_that_is_listed_twice_under_two_names_counts_once_and_is_named(tmp
     assert "the same bytes as" not in CliRunner().invoke(app, ["status", str(tmp_path / "SURVEY.toml")]).output
 
 
+@pytest.mark.slow
 def test_one_capture_in_two_runs_is_named(tmp_path: Path) -> None:
     """A drive that is listed twice would be two passes that agree."""
     capture(tmp_path / "l.pcap", heard(600.0, 600.1) + piece(600.2, 600.2))
@@ -179,6 +180,7 @@ def test_one_drive_that_was_written_anew_for_another_run_is_named(tmp_path: Path
     assert "to the nanosecond: they count a second time as two/roof" in said
 
 
+@pytest.mark.slow
 def test_parts_of_a_capture_in_another_order_are_used_and_named(tmp_path: Path) -> None:
     packets = heard(602.0, 602.1) + piece(602.2, 602.2, 700) + heard(600.0, 600.1) + piece(600.2, 600.2, 700)
     capture(tmp_path / "l.pcap", packets)

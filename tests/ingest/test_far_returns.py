@@ -41,6 +41,7 @@ def survey(folder: Path, unit_m: float) -> str:
     return said(folder, "ingest", "--workers", "0")[1]
 
 
+@pytest.mark.slow
 @pytest.mark.witness("far_returns")
 def test_returns_in_millimetres_are_named_and_metres_are_not(tmp_path: Path) -> None:
     named = survey(tmp_path / "mm", 0.001)

@@ -232,6 +232,7 @@ def test_the_unit_of_stamps_is_proposed_by_what_they_are(tmp_path: Path, content
         assert found["log"]["time"]["would_be"]["gps_week_seconds"] == "Sunday 08:53:38 GPS time" or unit == "s"
 
 
+@pytest.mark.slow
 def test_stamps_of_a_sunday_are_times(faults: Path) -> None:
     """LAS keeps seconds of the GPS week; below 86,400 they are a Sunday's."""
     (found,) = json.loads(roadscan("inspect", faults / "plane_week_seconds_sunday.laz", "--json").stdout)

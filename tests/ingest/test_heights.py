@@ -56,6 +56,7 @@ def sorted_points(file: Path) -> np.ndarray:
     return xyz[np.lexsort(xyz.T)]
 
 
+@pytest.mark.slow
 @pytest.mark.witness("height_not_stated")
 @pytest.mark.parametrize(("log", "defaults"), [('height = "ellipsoidal"', ""), ("", 'defaults.height = "ellipsoidal"')])
 def test_a_cloud_that_states_no_height_is_asked(faults: Path, tmp_path: Path, log: str, defaults: str) -> None:
@@ -125,6 +126,7 @@ def test_a_vertical_crs_of_another_kind_than_the_maps_heights(faults: Path, tmp_
     )
 
 
+@pytest.mark.slow
 def test_seconds_of_a_sunday_are_times(faults: Path, tmp_path: Path) -> None:
     """Seconds of the week below 86,400."""
     file = faults / "plane_week_seconds_sunday.laz"

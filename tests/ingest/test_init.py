@@ -89,6 +89,7 @@ def first(simulated: Simulated, tmp_path: Path) -> FirstSurvey:
     return write_first_survey(find_logs(tmp_path / "logs"), tmp_path / "SURVEY.toml")
 
 
+@pytest.mark.slow
 def test_a_simulated_survey_is_found_and_grouped(first: FirstSurvey, simulated: Simulated) -> None:
     survey = Survey.load(simulated.survey_file)
     stated = {
@@ -101,6 +102,7 @@ def test_a_simulated_survey_is_found_and_grouped(first: FirstSurvey, simulated: 
     assert [log.path.name for log in first.found.control] == ["control.csv"]
 
 
+@pytest.mark.slow
 def test_the_file_names_the_next_thing_to_complete(first: FirstSurvey, simulated: Simulated) -> None:
     """Question after question is named with its line; each goes away once it is answered."""
     assert "crs" not in tomllib.loads(first.survey_file.read_text())["map"]
@@ -124,6 +126,7 @@ def test_the_file_names_the_next_thing_to_complete(first: FirstSurvey, simulated
     assert Survey.load(first.survey_file).config.runs
 
 
+@pytest.mark.slow
 def test_what_other_logs_say_is_hinted_and_not_filled_in(first: FirstSurvey) -> None:
     text = first.survey_file.read_text()
     assert '#? clock = { system = "gps_week_seconds", week = ???? }' in text
@@ -132,6 +135,7 @@ def test_what_other_logs_say_is_hinted_and_not_filled_in(first: FirstSurvey) -> 
     assert "week = 2417" not in text
 
 
+@pytest.mark.slow
 def test_completing_it_gives_the_same_tiles(finished: Simulated, first: FirstSurvey) -> None:
     """All questions answered with what the simulator's own files say: the same tiles, byte for byte."""
     original = Survey.load(finished.survey_file)
@@ -151,6 +155,7 @@ def test_completing_it_gives_the_same_tiles(finished: Simulated, first: FirstSur
     assert [path for path in expected if made[path] != expected[path]] == []
 
 
+@pytest.mark.slow
 def test_nothing_is_overwritten(first: FirstSurvey) -> None:
     before = first.survey_file.read_bytes()
     with pytest.raises(ConfigError, match="never overwritten"):
@@ -160,6 +165,7 @@ def test_nothing_is_overwritten(first: FirstSurvey) -> None:
     assert first.survey_file.read_bytes() == before
 
 
+@pytest.mark.slow
 def test_the_command_says_what_it_did(first: FirstSurvey, tmp_path: Path) -> None:
     (tmp_path / "logs" / "notes.txt").write_text("rain from ten o'clock\n")
     done = CliRunner().invoke(app, ["init", str(tmp_path / "logs"), "--out", str(tmp_path / "second" / "SURVEY.toml")])
@@ -302,6 +308,7 @@ def test_an_empty_folder_is_refused(tmp_path: Path) -> None:
         find_logs(tmp_path / "none")
 
 
+@pytest.mark.slow
 def test_the_folder_of_recordings_is_sorted(recordings: Path, tmp_path: Path) -> None:
     """Passes of the same streets are runs of their own; what belongs to one drive stays together."""
     found = find_logs(recordings / "two_pass")
@@ -318,6 +325,7 @@ def test_the_folder_of_recordings_is_sorted(recordings: Path, tmp_path: Path) ->
 # --- by its questions alone ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_two_missions_in_one_folder_become_a_map_with_its_sigma(tmp_path: Path) -> None:
     """SBET, SMRMSG and PCAP of two passes side by side: every return where the simulator's beam hit."""
     scene = small_scene(length_m=6.0, profilers={"on": False}, lidar={"range_max_m": 6.0}).noiseless()

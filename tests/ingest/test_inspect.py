@@ -67,6 +67,7 @@ def text_of(found: Inspection) -> str:
 # --- recordings --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "name", "table", "rows", "duration_s"),
     [
@@ -505,6 +506,7 @@ def test_a_pipe_is_not_opened(tmp_path: Path) -> None:
     assert inspect(tmp_path / "pipe").error.endswith("neither a file nor a folder")
 
 
+@pytest.mark.slow
 def test_damaged_files_never_crash(tmp_path: Path) -> None:
     """Mutants of all samples: told, read, or refused with a message."""
     rng = random.Random(7)
@@ -577,6 +579,7 @@ def test_exit_codes_and_json(tmp_path: Path) -> None:
     assert "\x1b" not in bad.stdout
 
 
+@pytest.mark.slow
 def test_a_pipe_gets_plain_text(tmp_path: Path) -> None:
     path = written(tmp_path / "drive.sbet", sbet(200_000 + np.arange(50) / 200))
     command = [sys.executable, "-m", "roadscan", "inspect", str(path), "--clock", "weeks"]

@@ -34,6 +34,7 @@ def northing_m(file: Path) -> np.ndarray:
     return np.concatenate(points) - start_m
 
 
+@pytest.mark.slow
 @pytest.mark.witness("lidar_clock_step")
 @pytest.mark.parametrize("case", ["restart", "lock_midway"])
 def test_readings_of_a_clock_that_stepped_are_left_out_and_named(tmp_path: Path, faults: Path, case: str) -> None:

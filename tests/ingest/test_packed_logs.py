@@ -30,6 +30,7 @@ def write_bomb(path: Path, first: bytes, part: bytes, mib: int) -> None:
             out.write(block)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", [b"\0", b"1461922219.000,500000,5300000,102,0,0,45\n"], ids=["zeros", "one line"])
 def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, part: bytes) -> None:
     file = write_survey(tmp_path, SOUND)
@@ -44,6 +45,7 @@ def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path: Path, part: bytes) ->
     assert "at most 200 bytes of it for a byte of the packed file" in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("packing", PACK)
 def test_the_most_regular_log_is_no_bomb(tmp_path: Path, packing: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """100 poses a second of a vehicle that stands, without noise: nothing recorded packs better."""

@@ -223,6 +223,7 @@ def test_positions_in_radians_of_32_bits_are_named(tmp_path: Path) -> None:
     assert "the latitude is held in steps of 3.4e-06 °" in found["coarse_values"]
 
 
+@pytest.mark.slow
 @pytest.mark.witness("ticks_still")
 def test_ticks_that_stand_still_are_named_and_coarse_positions_accuse_no_clock(tmp_path: Path) -> None:
     def make(where: Path) -> None:

@@ -146,6 +146,7 @@ def test_returns_of_one_pulse_are_not_one_point(tmp_path: Path) -> None:
     assert len(points) == N and not reasons
 
 
+@pytest.mark.slow
 def test_a_cloud_written_anew_at_another_scale_counts_once(tmp_path: Path) -> None:
     write(tmp_path / "c.las", road())
     write(tmp_path / "d.las", road(), scale=0.0001)
@@ -173,6 +174,7 @@ def twice_driven(tmp_path_factory: pytest.TempPathFactory) -> Callable[[float], 
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.witness("passes_apart")
 def test_two_clouds_of_one_road_at_two_heights_are_named(twice_driven: Callable[[float], Any]) -> None:
     said, status = twice_driven(0.5)
@@ -184,10 +186,12 @@ def test_two_clouds_of_one_road_at_two_heights_are_named(twice_driven: Callable[
     assert "no place where passes overlap" not in status and "points of a cloud are placed already" in status
 
 
+@pytest.mark.slow
 def test_two_clouds_of_one_road_within_their_noise_are_not(twice_driven: Callable[[float], Any]) -> None:
     assert twice_driven(0.01)[0]["findings"] == []
 
 
+@pytest.mark.slow
 @pytest.mark.witness("vertical_datum")
 def test_heights_of_another_datum_are_refused_or_transformed(tmp_path: Path) -> None:
     """EGM96 to DHHN2016 takes grids that are not here; EVRF2007 to DHHN2016 is known to 0.1 m without any."""

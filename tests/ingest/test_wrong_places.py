@@ -345,6 +345,7 @@ def test_two_sites_far_apart_have_a_report(survey: Path) -> None:
     assert "Places to look at" in (survey / "store/survey=s/report/report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_recordings_raise_no_doubt(recordings: Path, tmp_path: Path) -> None:
     """Poses of cars and of a robot, as they were published."""
     robot = tmp_path / "aces.clf"

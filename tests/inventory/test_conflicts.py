@@ -51,6 +51,7 @@ def test_two_editors_on_two_copies(street: Inventory, tmp_path: Path) -> None:
     assert (conflict.in_force, conflict.other, conflict.who, done.conflicts) == ("3", "8", "max", 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("choice", "value"), [("edit", 3), ("other", 8), ("evidence", None)])
 def test_a_person_settles_a_conflict_in_its_layer(
     street: Inventory, tmp_path: Path, choice: str, value: object
@@ -67,6 +68,7 @@ def test_a_person_settles_a_conflict_in_its_layer(
     assert held == value
 
 
+@pytest.mark.slow
 def test_an_edit_that_waits_waits_until_it_is_decided(street: Inventory, tmp_path: Path) -> None:
     test_two_editors_on_two_copies(street, tmp_path)  # 3 is in force, 8 waits
     third = tmp_path / "third.gpkg"

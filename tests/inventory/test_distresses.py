@@ -68,6 +68,7 @@ def by_place(state: State, kind: str) -> list[dict[str, Any]]:
     return sorted(rows, key=lambda r: (round(r["easting_m"]), r["northing_m"]))
 
 
+@pytest.mark.slow
 def test_edits_of_distresses_survive_reprocessing_and_a_new_epoch(home: Any, tmp_path: Path) -> None:
     street = street_of(tmp_path, home)
     shadow = crack(20.0, 0.0)
@@ -124,6 +125,7 @@ def test_edits_of_distresses_survive_reprocessing_and_a_new_epoch(home: Any, tmp
     assert all(then.assets[kind].rows.equals(edited.assets[kind].rows) for kind in ("crack", "pothole"))
 
 
+@pytest.mark.slow
 def test_a_home_of_an_older_version_gets_the_layers_of_new_kinds(home: Any, tmp_path: Path) -> None:
     everything, home.kinds = home.kinds, ("pole", "sign")
     street = street_of(tmp_path, home)
@@ -138,6 +140,7 @@ def test_a_home_of_an_older_version_gets_the_layers_of_new_kinds(home: Any, tmp_
     assert len(street.pull().edits) == 1
 
 
+@pytest.mark.slow
 def test_values_beside_the_lists_are_named(tmp_path: Path) -> None:
     home = InFile(tmp_path / "inventory.gpkg", CRS)
     street = street_of(tmp_path, home)

@@ -67,6 +67,7 @@ def run(*words: object, code: int = 0) -> str:
     return done.output
 
 
+@pytest.mark.slow
 def test_the_commands_from_publication_to_export(survey_file: Path, tmp_path: Path) -> None:
     assert "7 assets as of commit 1" in run("publish", survey_file)
     file = tmp_path / "inventory.gpkg"
@@ -99,6 +100,7 @@ def test_the_commands_from_publication_to_export(survey_file: Path, tmp_path: Pa
     assert isinstance(wrong.exception, ConfigError)
 
 
+@pytest.mark.slow
 def test_python_says_the_same(survey_file: Path) -> None:
     survey = roadscan.open_survey(survey_file)
     inventory = survey.inventory
@@ -229,6 +231,7 @@ def test_damage_of_the_truth_is_named(tmp_path: Path) -> None:
         inventory(tmp_path).state()
 
 
+@pytest.mark.slow
 def test_verify_names_each_damaged_file_of_the_inventory(survey_file: Path) -> None:
     survey = roadscan.open_survey(survey_file)
     survey.inventory.publish()
@@ -283,6 +286,7 @@ def test_a_conflict_names_the_pictures_of_its_asset() -> None:
     assert pictures_of({"pictures": None}) is pictures_of({}) is None
 
 
+@pytest.mark.slow
 def test_two_surveys_share_an_inventory(tmp_path: Path) -> None:
     ids = []
     for name, when in (("spring", None), ("autumn", AUTUMN)):
@@ -300,6 +304,7 @@ def test_two_surveys_share_an_inventory(tmp_path: Path) -> None:
     assert set(shown["source"]) == {"autumn"} and pd.to_datetime(shown["valid_from"]).dt.month.eq(5).all()
 
 
+@pytest.mark.slow
 def test_the_report_tells_of_assets_conflicts_and_changes(survey_file: Path) -> None:
     survey = roadscan.open_survey(survey_file)
     section = next(one for one in sections() if one.name == "inventory")

@@ -62,6 +62,7 @@ def exported(survey_file: Path, crs: object, *, states_it: object = None) -> Non
     person.replace(home(survey_file), "poles", frame)
 
 
+@pytest.mark.slow
 @pytest.mark.witness("crs_of_edits")
 def test_a_layer_in_another_crs_is_brought_into_the_map(survey_file: Path) -> None:
     one, *_ = ids(survey_file)
@@ -109,6 +110,7 @@ UNLIKELY = [
 ]
 
 
+@pytest.mark.slow
 def test_an_unlikely_place_is_in_force_once_it_is_confirmed(survey_file: Path) -> None:
     one, second, *_ = ids(survey_file)
     for number, (moved, told) in enumerate(UNLIKELY):
@@ -123,6 +125,7 @@ def test_an_unlikely_place_is_in_force_once_it_is_confirmed(survey_file: Path) -
     assert place(survey_file, one).equals(moved)
 
 
+@pytest.mark.slow
 def test_a_drawn_asset_far_from_all_others_is_asked_about(survey_file: Path) -> None:
     person.draw(home(survey_file), "poles", shapely.Point(EAST + 9000.0, NORTH, 100.0))
     told = run("pull", survey_file, code=1)
@@ -135,6 +138,7 @@ def emptied(survey_file: Path, keep: int) -> None:
     person.replace(home(survey_file), "poles", person.layer(home(survey_file), "poles").iloc[:keep])
 
 
+@pytest.mark.slow
 @pytest.mark.witness("deleted_layer")
 @pytest.mark.parametrize("keep", [0, 1])
 def test_a_layer_that_was_emptied_is_asked_about(survey_file: Path, keep: int) -> None:
@@ -160,6 +164,7 @@ def test_assets_that_a_person_deletes_one_by_one_are_not_asked_about(survey_file
     assert "4 values of 4 assets" in run("pull", survey_file)
 
 
+@pytest.mark.slow
 @pytest.mark.witness("sizes_of_edits")
 def test_a_size_unlike_what_was_found_is_asked_about(survey_file: Path) -> None:
     one, second, *others = ids(survey_file)
@@ -205,6 +210,7 @@ CELLS = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.witness("stored_values")
 def test_a_cell_that_is_not_of_its_column_is_named(survey_file: Path) -> None:
     write_found(
@@ -232,6 +238,7 @@ def test_a_cell_that_is_not_of_its_column_is_named(survey_file: Path) -> None:
     assert frame["condition"].isna().all() and frame["valid_to"].isna().all()
 
 
+@pytest.mark.slow
 def test_a_number_as_geopandas_writes_it_is_no_fault(survey_file: Path) -> None:
     one = ids(survey_file)[0]
     person.edit(home(survey_file), "poles", one, condition=3.0)  # with NaN beside it: a column of floats
@@ -240,6 +247,7 @@ def test_a_number_as_geopandas_writes_it_is_no_fault(survey_file: Path) -> None:
     assert f"poles, {one}: condition is 3.7, expected a whole number" in run("pull", survey_file, code=1)
 
 
+@pytest.mark.slow
 def test_what_people_added_to_the_file_outlives_publications(survey_file: Path) -> None:
     file, one = home(survey_file), ids(survey_file)[0]
     hives = geopandas.GeoDataFrame({"species": ["oak", "lime"]}, geometry=[FIRST, FIRST], crs=32632)
@@ -295,6 +303,7 @@ sys.stdin.read()
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lock", ["IMMEDIATE", "EXCLUSIVE"])
 def test_a_locked_file_is_said_to_be_locked_and_by_whom(survey_file: Path, lock: str) -> None:
     person.edit(home(survey_file), "poles", ids(survey_file)[0], condition=3)
@@ -329,6 +338,7 @@ def decide(survey_file: Path, choice: str) -> None:
     person.replace(home(survey_file), "conflicts", layer)
 
 
+@pytest.mark.slow
 def test_a_rejected_asset_comes_back_and_nothing_jams(survey_file: Path) -> None:
     one = rejected_and_edited(survey_file)
     decide(survey_file, "other")
@@ -340,6 +350,7 @@ def test_a_rejected_asset_comes_back_and_nothing_jams(survey_file: Path) -> None
     assert person.layer(home(survey_file), "poles").set_index("asset_id").loc[one, "condition"] == 3
 
 
+@pytest.mark.slow
 def test_a_rejected_parent_comes_back_by_other(survey_file: Path) -> None:
     one, *_ = ids(survey_file)
     sign = person.ids(home(survey_file), "road_signs")[0]
@@ -354,6 +365,7 @@ def test_a_rejected_parent_comes_back_by_other(survey_file: Path) -> None:
     assert inventory.conflicts() == [] and list(inventory.assets("sign")["parent"]) == [one]
 
 
+@pytest.mark.slow
 def test_a_decision_that_chooses_nothing_is_a_named_row(survey_file: Path) -> None:
     one = ids(survey_file)[0]
     person.edit(home(survey_file), "poles", one, asset_height_m=9.0)
@@ -368,6 +380,7 @@ def test_a_decision_that_chooses_nothing_is_a_named_row(survey_file: Path) -> No
     assert "1 values" in run("pull", survey_file)
 
 
+@pytest.mark.slow
 def test_an_old_copy_begins_from_what_it_showed(survey_file: Path) -> None:
     one, copy = ids(survey_file)[0], survey_file.parent / "old.gpkg"
     copy.write_bytes(home(survey_file).read_bytes())

@@ -346,6 +346,7 @@ def test_gdal_reads_it_without_a_word(street: Inventory) -> None:
     assert "3D Point" in done.stdout
 
 
+@pytest.mark.slow
 def test_gdals_validator_finds_nothing(tmp_path: Path) -> None:
     python = "/usr/bin/python3"
     python, module = "/usr/bin/python3", "osgeo_utils.samples.validate_gpkg"

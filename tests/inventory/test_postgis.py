@@ -47,6 +47,7 @@ def execute(address: str, statement: str, role: str | None = None) -> list[Any]:
         return done.fetchall() if done.description else []
 
 
+@pytest.mark.slow
 def test_it_shows_what_was_found_and_takes_back_nothing(street: Inventory, address: str) -> None:
     rows = execute(address, "SELECT asset_id, asset_height_m, ST_Z(geom), ST_SRID(geom) FROM street.poles ORDER BY 2")
     assert [r[1:] for r in rows] == [(5.0 + 0.1 * n, 100.0 + n, 32632) for n in range(6)]
@@ -55,6 +56,7 @@ def test_it_shows_what_was_found_and_takes_back_nothing(street: Inventory, addre
     assert street.status().to_pull == 0
 
 
+@pytest.mark.slow
 def test_its_project_names_the_tables_and_no_password(street: Inventory, tmp_path: Path, address: str) -> None:
     text = (tmp_path / "inventory-postgis.qgs").read_text()
     layers = {
@@ -68,6 +70,7 @@ def test_its_project_names_the_tables_and_no_password(street: Inventory, tmp_pat
     assert "secret" not in text and "admin" not in text
 
 
+@pytest.mark.slow
 def test_edits_of_several_people_are_taken_in_with_their_names(street: Inventory, address: str) -> None:
     execute(address, "CREATE ROLE eva LOGIN IN ROLE street_editor; CREATE ROLE max LOGIN IN ROLE street_editor")
     try:
@@ -97,6 +100,7 @@ def test_edits_of_several_people_are_taken_in_with_their_names(street: Inventory
         execute(address, "DROP OWNED BY eva, max; DROP ROLE eva, max")
 
 
+@pytest.mark.slow
 def test_an_edit_survives_a_new_epoch_and_conflicts_are_shown(street: Inventory, address: str) -> None:
     one = execute(address, "SELECT asset_id FROM street.poles ORDER BY station_m LIMIT 1")[0][0]
     execute(address, f"UPDATE street.poles SET asset_height_m = 7.5 WHERE asset_id = '{one}'")
@@ -113,6 +117,7 @@ def test_an_edit_survives_a_new_epoch_and_conflicts_are_shown(street: Inventory,
     assert street.conflicts() == []
 
 
+@pytest.mark.slow
 def test_an_editor_of_a_copy_and_one_of_the_database(street: Inventory, tmp_path: Path, address: str) -> None:
     copy = inventory(tmp_path, Everywhere())
     copy.publish()
@@ -129,6 +134,7 @@ def test_an_editor_of_a_copy_and_one_of_the_database(street: Inventory, tmp_path
     assert (conflict.asset_id, conflict.reason, conflict.in_force, conflict.other) == (first, "edit", "8", "3")
 
 
+@pytest.mark.slow
 def test_readers_may_look_and_editors_may_not_change_the_history(street: Inventory, address: str) -> None:
     assert execute(address, "SELECT count(*) FROM street.poles", role="street_reader") == [(6,)]
     for role, statement in (
@@ -143,6 +149,7 @@ def test_readers_may_look_and_editors_may_not_change_the_history(street: Invento
         execute(address, "UPDATE street.poles SET condition = 11", role="street_editor")
 
 
+@pytest.mark.slow
 def test_every_administrator_publishes_and_no_editor_hides_a_change(street: Inventory, address: str) -> None:
     execute(address, "CREATE ROLE ada LOGIN IN ROLE street_admin; CREATE ROLE eva LOGIN IN ROLE street_editor")
     try:
@@ -159,6 +166,7 @@ def test_every_administrator_publishes_and_no_editor_hides_a_change(street: Inve
         execute(address, "DROP ROLE ada; DROP ROLE eva")
 
 
+@pytest.mark.slow
 def test_a_faulty_row_is_named(street: Inventory, address: str) -> None:
     one = execute(address, "SELECT asset_id FROM street.poles LIMIT 1")[0][0]
     execute(address, f"UPDATE street.poles SET parent = 'pole-x' WHERE asset_id = '{one}'")
@@ -166,6 +174,7 @@ def test_a_faulty_row_is_named(street: Inventory, address: str) -> None:
         street.pull()
 
 
+@pytest.mark.slow
 def test_a_lost_connection_leaves_the_old_state_whole(
     street: Inventory, address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -188,6 +197,7 @@ def test_a_lost_connection_leaves_the_old_state_whole(
     assert execute(address, "SELECT count(*) FROM street.poles WHERE source = 'autumn'") == [(3,)]
 
 
+@pytest.mark.slow
 def test_an_edit_between_reading_and_publishing_is_not_overwritten(street: Inventory, address: str) -> None:
     read = street.home.read
 
@@ -202,6 +212,7 @@ def test_an_edit_between_reading_and_publishing_is_not_overwritten(street: Inven
     assert execute(address, "SELECT DISTINCT condition FROM street.poles") == [(4,)]
 
 
+@pytest.mark.slow
 def test_two_programs_at_once_wait_for_one_another(street: Inventory, tmp_path: Path, address: str) -> None:
     street.record(found(poles(4, when=AUTUMN), "autumn"))
     others = [inventory(tmp_path, Everywhere()) for _ in range(3)]
@@ -223,6 +234,7 @@ def test_two_programs_at_once_wait_for_one_another(street: Inventory, tmp_path: 
     assert execute(address, "SELECT count(*), count(DISTINCT asset_id) FROM street.poles") == [(6, 6)]
 
 
+@pytest.mark.slow
 def test_a_foreign_schema_and_a_server_that_is_not_there_are_named(tmp_path: Path, address: str) -> None:
     execute(address, "CREATE SCHEMA foreign_one")
     made = inventory(tmp_path)
@@ -238,6 +250,7 @@ def test_a_foreign_schema_and_a_server_that_is_not_there_are_named(tmp_path: Pat
     assert "secret" not in str(wrong.value)
 
 
+@pytest.mark.slow
 def test_a_table_that_was_altered_to_another_srid_is_brought_into_the_map(street: Inventory, address: str) -> None:
     execute(address, "DROP VIEW street.poles_current")
     execute(

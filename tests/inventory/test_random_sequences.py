@@ -382,6 +382,7 @@ def run(machine: type[Street], sequences: int, steps: int) -> Counter[str]:
     return tally
 
 
+@pytest.mark.slow
 def test_no_sequence_loses_an_edit() -> None:
     run(Street, sequences=8, steps=14)
 

@@ -57,6 +57,7 @@ home = "../inventory.gpkg"
 """
 
 
+@pytest.mark.slow
 def test_the_demo_tells_of_two_epochs_and_of_the_edit_between(tmp_path: Path) -> None:
     epochs = {SPRING: poles(), AUTUMN: [*poles(5, when=IN_AUTUMN), *poles(1, when=IN_AUTUMN, station_m=-1.0)][:5]}
     files = {}

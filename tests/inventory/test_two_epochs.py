@@ -60,6 +60,7 @@ class Town:
         return rows
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_changes_of_the_road_are_found_and_what_is_hidden_is_never_gone(seed: int, tmp_path: Path) -> None:
     town = Town(seed)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from roadscan.assets.kernels.paint_levels import FEWEST, paint_levels
 
@@ -15,6 +16,7 @@ def levels(value: np.ndarray, cell: np.ndarray, shape: tuple[int, int], half: in
     return level, upper
 
 
+@pytest.mark.slow
 def test_level_of_a_bare_surface_is_its_median_and_the_bound_one_sigma_above() -> None:
     rng = np.random.default_rng(4)
     cell = np.repeat(np.arange(25), 16)

@@ -134,6 +134,7 @@ def test_a_scan_line_is_one_laser_within_a_step_of_time() -> None:
     assert out[4] == out[1]
 
 
+@pytest.mark.slow
 def test_values_of_a_group_count_once() -> None:
     out = np.empty(3, np.int64)
     distinct_in_groups(np.array([0, 3, 3, 5]), np.array([4, 0, 2, 1, 3]), np.array([7, 9, 7, 9, 8]), out)

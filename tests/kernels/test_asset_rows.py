@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
+import pytest
 from scipy.ndimage import binary_propagation
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -61,6 +62,7 @@ def test_ground_grows_as_a_binary_propagation() -> None:
     assert strict.sum() == level.sum() and (strict.reshape(shape) == level).all()
 
 
+@pytest.mark.slow
 def test_groups_are_sorted_each_by_itself() -> None:
     key = np.random.default_rng(1).permutation(200).astype(np.int64)
     begins, order = np.array([0, 50, 50, 130, 200], np.int64), np.empty(200, np.int64)
@@ -69,6 +71,7 @@ def test_groups_are_sorted_each_by_itself() -> None:
         assert (order[first:end] == first + np.argsort(key[first:end])).all()
 
 
+@pytest.mark.slow
 def test_components_near_a_leaning_axis_are_kept_and_one_beside_it_is_not() -> None:
     level = np.arange(12, dtype=np.int64)
     x, y = 5.0 + 0.01 * level, 2.0 - 0.005 * level
@@ -78,6 +81,7 @@ def test_components_near_a_leaning_axis_are_kept_and_one_beside_it_is_not() -> N
     assert np.flatnonzero(~kept).tolist() == [6]
 
 
+@pytest.mark.slow
 def test_the_longest_run_of_levels_is_kept() -> None:
     level = np.array([0, 1, 2, 9, 10, 11, 12, 20], np.int64)
     kept = np.ones(8, np.bool_)
@@ -88,6 +92,7 @@ def test_the_longest_run_of_levels_is_kept() -> None:
     assert not kept.any()
 
 
+@pytest.mark.slow
 def test_widths_of_levels_are_those_of_quantiles() -> None:
     draw = np.random.default_rng(2)
     xyh, level = draw.normal(size=(300, 3)), draw.integers(0, 5, 300)
@@ -101,6 +106,7 @@ def test_widths_of_levels_are_those_of_quantiles() -> None:
     assert widths[4] == -1.0
 
 
+@pytest.mark.slow
 def test_a_spot_grows_over_what_hangs_together_with_its_square() -> None:
     """A bright disc, a bright place apart from it, and noise: as SciPy's trees and graphs tell them."""
     draw = np.random.default_rng(5)

@@ -11,6 +11,8 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[2]
 LIBRARY = ROOT / "roadscan"
 
@@ -96,6 +98,7 @@ def names_in(*folders: str) -> dict[Path, set[str]]:
     return {file: imported(file) for folder in folders for file in (ROOT / folder).rglob("*.py")}
 
 
+@pytest.mark.slow
 def test_every_kernel_is_tested_by_name() -> None:
     library, tests = names_in("roadscan"), set().union(*names_in("tests").values())
     wanted = set()

@@ -18,6 +18,7 @@ def total(pair):
 PAIR = "from typing import NamedTuple\n\nclass Pair(NamedTuple):\n    first: int\n    second: int\n"
 
 
+@pytest.mark.slow
 def test_a_class_that_moved_is_compiled_for_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Numba's index of a function's cache holds the classes of arguments by module and name."""
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))

@@ -36,6 +36,7 @@ def real_triangles(mesh, count: int) -> set[tuple[int, ...]]:
     return {tuple(sorted(t)) for t in mesh.triangles[:count].tolist() if beyond not in t}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [3, 4, 50, 400])
 def test_triangles_are_those_of_qhull(n: int) -> None:
     places = scattered(n, n)
@@ -68,6 +69,7 @@ def test_walk_finds_the_triangle_and_dig_the_circles() -> None:
         assert edges == many + 2
 
 
+@pytest.mark.slow
 def test_weights_are_the_areas_that_voronoi_cells_lose() -> None:
     """With and without the place, by GEOS; the values make each weight visible in turn."""
     places, value = scattered(60, 2), np.random.default_rng(3).normal(size=60)

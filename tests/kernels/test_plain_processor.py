@@ -39,6 +39,7 @@ def without_avx512(command: list[str], **more: str) -> str:
     return found.stdout
 
 
+@pytest.mark.slow
 def test_a_few_kernels_on_a_plain_processor(tmp_path: Path) -> None:
     """The machine code has no register of 512 bits, and says the same."""
     assert without_avx512([sys.executable, "-c", REGISTERS], NUMBA_CACHE_DIR=str(tmp_path)).strip() == "False"

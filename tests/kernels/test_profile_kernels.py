@@ -17,6 +17,7 @@ MOTION = np.array([[0, 1, 0, 0], [-K2, -C, K2, C], [0, 0, 0, 1], [K2 / MU, C / M
 ROAD = np.array([[0], [0], [0], [K1 / MU]])
 
 
+@pytest.mark.slow
 def test_against_scipy_step_by_step() -> None:
     """`lsim` of the same equations, input held over each step, at two spacings and an irregular one."""
     rng = np.random.default_rng(3)

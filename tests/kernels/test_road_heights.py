@@ -59,6 +59,7 @@ def heights(table: CellTable, places: np.ndarray, bend: bool = False) -> np.ndar
     return out
 
 
+@pytest.mark.slow
 def test_heights_of_a_plane_are_exact_whatever_cells_lack_and_across_tiles() -> None:
     def plane(e: np.ndarray, n: np.ndarray) -> np.ndarray:
         return 500.0 + 0.03 * e - 0.05 * n

@@ -204,6 +204,7 @@ def test_ties_are_differences_of_places() -> None:
     np.testing.assert_allclose(rows[:, :, 0], 2.0 * (after - residual) / 1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_profiles_through_splines() -> None:
     """A plane stays a plane."""
     across = np.tile(np.arange(-1.0, 1.0001, 0.02), (4, 1))
@@ -237,6 +238,7 @@ def test_flipped_edges_are_delaunays() -> None:
     assert {tuple(sorted(t)) for t in triangles.tolist()} == expected
 
 
+@pytest.mark.slow
 def test_filters_of_a_plane_act_nowhere_else_than_inside() -> None:
     i, j = np.mgrid[0:9, 0:10].astype(float)
     surface, measured = 3.0 + 0.01 * i - 0.02 * j, np.ones((9, 10))
@@ -251,6 +253,7 @@ def test_filters_of_a_plane_act_nowhere_else_than_inside() -> None:
     assert not after.any()
 
 
+@pytest.mark.slow
 def test_ground_about_a_hole() -> None:
     heights = np.tile(0.01 * np.arange(21.0)[:, None], (1, 21))
     out = np.zeros((1, 2))

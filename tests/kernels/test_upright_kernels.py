@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from roadscan.assets.kernels.buckets import count_buckets, fill_buckets
 from roadscan.assets.kernels.columns import mark_corridor
@@ -93,6 +94,7 @@ def test_sight_lines_through_a_rectangle() -> None:
     ]  # at 1.5 and 3 m; the others end before it, beside it, or close behind it
 
 
+@pytest.mark.slow
 def test_a_cylinder_seen_from_one_side() -> None:
     rng = np.random.default_rng(4)
     radius, n = 0.06, 600

@@ -147,6 +147,7 @@ def write_adjusted(store: Store, mounting: np.ndarray, lens: np.ndarray) -> None
         write_small(store, table, [row])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adjusted", [False, True], ids=["as the rig file states", "as an adjustment found"])
 def test_stated_sigma_is_right_where_poses_mounting_and_lens_are_disturbed(
     measured_drive: Drive, tmp_path: Path, adjusted: bool

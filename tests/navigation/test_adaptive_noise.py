@@ -45,6 +45,7 @@ def adapted(seed: int, sigma_factor: float = 1.0) -> tuple[Walked, Solution]:
     return walk, solve_adaptively(walk.imu, walk.masked, None, walk.vehicle, WALKER).solution
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma_factor", [1.0, 3.0])
 def test_sigma_of_a_walk_is_honest_in_outages(sigma_factor: float) -> None:
     """The settings of a vehicle, a lever arm wrong by 3 cm, errors of the IMU beyond its data sheet; receivers that

@@ -74,6 +74,7 @@ def test_offset_to_0_2_ms_and_drift_to_1_ppm_of_an_encoder(driven: Driven, tmp_p
     assert fit.gain == pytest.approx(1.006, abs=3e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "grade", "length_m", "noise"),
     [

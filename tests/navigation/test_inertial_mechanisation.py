@@ -56,6 +56,7 @@ def integrated(
     return q, v, r
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The copy keyword is deprecated")
 @pytest.mark.parametrize("latitude", [48.0, -33.0, 84.0])
 def test_mechanisation_agrees_with_pyins(latitude: float) -> None:

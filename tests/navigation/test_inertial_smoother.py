@@ -89,6 +89,7 @@ def test_odometer_scale_of_a_real_car(recordings: Path) -> None:
     assert 5e-5 < sigma < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("grade", ["tactical", "mems"])
 def test_errors_agree_with_their_covariance(grade: ImuGrade) -> None:
     """Normalised squared errors over the drive, mean of six seeds; `benchmarks/bench_smoother.py` does 50.

@@ -120,6 +120,7 @@ def survey_of(folder: Path, sweeps: list[Sweep], crs: str = 'local = { name = "n
     return folder / "SURVEY.toml"
 
 
+@pytest.mark.slow
 def test_a_lidar_alone_makes_a_local_map(tmp_path: Path) -> None:
     survey_file = survey_of(tmp_path, [sweep(k) for k in range(SWEEPS)])
     for command in ("ingest", "navigate"):

@@ -87,6 +87,7 @@ def errors_of(simulated: Simulated, rows: pa.Table) -> tuple[np.ndarray, np.ndar
     return (position - poses.position_world_m)[poses.found], angle[poses.found]
 
 
+@pytest.mark.slow
 def test_a_run_without_a_trajectory_log_computes_its_own(navigated: Simulated) -> None:
     rows = computed(navigated)
     error, angle = errors_of(navigated, rows)
@@ -97,6 +98,7 @@ def test_a_run_without_a_trajectory_log_computes_its_own(navigated: Simulated) -
     assert (sigma > 0.001).all() and np.mean(np.linalg.norm(error, axis=1) < 2.5 * sigma[: len(error)]) > 0.9
 
 
+@pytest.mark.slow
 def test_its_points_and_products_come_out_as_of_any_trajectory(navigated: Simulated) -> None:
     store = navigated.store()
     counted = query(store, "SELECT sum(points) AS n FROM tiles").to_pylist()[0]["n"]
@@ -111,6 +113,7 @@ def test_its_points_and_products_come_out_as_of_any_trajectory(navigated: Simula
     assert abs(scale["value"] + 0.004) < 4 * scale["sigma"]  # the wheel gives more ticks a metre than stated
 
 
+@pytest.mark.slow
 def test_a_second_run_computes_nothing_and_changes_nothing(navigated: Simulated) -> None:
     before = outputs(navigated.store())
     run = navigated.run(**without_trajectory(navigated.survey_file, *MEASURED))
@@ -118,6 +121,7 @@ def test_a_second_run_computes_nothing_and_changes_nothing(navigated: Simulated)
     assert outputs(navigated.store()) == before
 
 
+@pytest.mark.slow
 def test_another_rig_makes_another_trajectory_and_the_old_one_is_kept_aside(navigated: Simulated) -> None:
     runs = without_trajectory(navigated.survey_file, *MEASURED)
     navigated.run("store-2", **runs)
@@ -130,11 +134,13 @@ def test_another_rig_makes_another_trajectory_and_the_old_one_is_kept_aside(navi
     assert navigated.store("store-2").files("superseded/tables/trajectory", ".parquet")
 
 
+@pytest.mark.slow
 def test_same_logs_same_bytes(navigated: Simulated) -> None:
     navigated.run("store-3", **without_trajectory(navigated.survey_file, *MEASURED))
     assert computed(navigated).equals(computed(navigated, "store-3"))
 
 
+@pytest.mark.slow
 def test_solve_always_prefers_the_computed_one(driven: Simulated) -> None:
     driven.run("store-4", navigation__solve="always", **FEW)
     logged = [r for r in read_log_records(driven.store("store-4")) if r.format == "sbet"]
@@ -142,6 +148,7 @@ def test_solve_always_prefers_the_computed_one(driven: Simulated) -> None:
     assert computed(driven, "store-4").equals(computed(driven)) or len(computed(driven, "store-4")) > 1000
 
 
+@pytest.mark.slow
 def test_an_imu_without_stated_errors_is_refused(driven: Simulated) -> None:
     rig = Survey.load(driven.survey_file).rig.model_dump()
     rig["sensors"]["imu"]["imu"] = None
@@ -149,6 +156,7 @@ def test_an_imu_without_stated_errors_is_refused(driven: Simulated) -> None:
         driven.run("store-5", **without_trajectory(driven.survey_file, *MEASURED), rig=rig)
 
 
+@pytest.mark.slow
 def test_solve_never_says_what_is_missing(driven: Simulated) -> None:
     with pytest.raises(RoadscanError, match="no trajectory"):
         driven.run("store-6", **without_trajectory(driven.survey_file, *MEASURED), navigation__solve="never")
@@ -159,6 +167,7 @@ def with_spline(**settings: Any) -> dict[str, Any]:
     return {"navigation__spline": {"on": True, **settings}, **FEW}
 
 
+@pytest.mark.slow
 def test_a_sound_trajectory_log_stays_as_it_is(driven: Simulated) -> None:
     driven.run("store-log", **FEW)
     driven.run("store-spline", **with_spline())
@@ -168,6 +177,7 @@ def test_a_sound_trajectory_log_stays_as_it_is(driven: Simulated) -> None:
     assert (record.format, record.attributes["poses_changed"]) == ("spline", 0)
 
 
+@pytest.mark.slow
 def test_a_short_gap_of_a_trajectory_log_is_filled_where_that_is_wanted(navigated: Simulated, tmp_path: Path) -> None:
     copy = navigated.copy_to(tmp_path / "survey")
     (log,) = (copy.survey_file.parent / "raw" / "run-1").glob("*.sbet")

@@ -59,6 +59,7 @@ def write_raw(folder: Path, seconds: np.ndarray, places: np.ndarray) -> dict[str
     return {"base": base, "navigation": ["raw/brdc.nav"]}
 
 
+@pytest.mark.slow
 def test_raw_observations_become_a_trajectory(tmp_path: Path) -> None:
     simulated = Simulated(simulate(navigating_scene(), tmp_path / "survey").survey_file)
     raw = simulated.survey_file.parent / "raw"

@@ -41,6 +41,7 @@ def gnss_survey(folder: Path, *logs: dict[str, Any]) -> Survey:
     return Survey.parse(values, folder=folder)
 
 
+@pytest.mark.slow
 def test_gnss_logs_leave_a_run_as_it_is(finished: Simulated, tmp_path: Path) -> None:
     survey = Survey.load(finished.survey_file)
     runs = survey.config.model_dump()["runs"]

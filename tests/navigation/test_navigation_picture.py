@@ -114,6 +114,7 @@ def test_gnss_between_the_pieces_of_a_solution_has_no_residual() -> None:
     assert seconds.size > 100
 
 
+@pytest.mark.slow
 def test_picture_is_written_whole_and_always_the_same(tmp_path: Path) -> None:
     draw_navigation(tmp_path / "a.png", picture())
     draw_navigation(tmp_path / "b.png", picture())
@@ -137,6 +138,7 @@ def test_picture_is_written_whole_and_always_the_same(tmp_path: Path) -> None:
     assert (np.abs(image.astype(int) - [201, 217, 243]).max(axis=2) < 3).sum() < 1000
 
 
+@pytest.mark.slow
 def test_picture_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         draw_navigation(tmp_path / "missing" / "a.png", picture())

@@ -102,6 +102,7 @@ def alone(driven: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -
     return place
 
 
+@pytest.mark.slow
 def test_a_survey_of_gnss_and_imu_alone_ends_well(alone: Place) -> None:
     assert alone.do("run", "--workers", "0") == 0
     assert "drawn:" not in alone.said and "computed:" not in alone.said
@@ -117,6 +118,7 @@ def test_a_survey_of_gnss_and_imu_alone_ends_well(alone: Place) -> None:
         assert "nothing to place" in alone.said
 
 
+@pytest.mark.slow
 def test_status_waits_for_a_trajectory(driven: tuple[Path, Path], tmp_path: Path) -> None:
     place = survey_of(tmp_path, *driven)
     assert place.do("ingest", "--workers", "0") == 0
@@ -124,6 +126,7 @@ def test_status_waits_for_a_trajectory(driven: tuple[Path, Path], tmp_path: Path
     assert "trajectory of run 'run-1': waiting" in place.said
 
 
+@pytest.mark.slow
 def test_the_report_tells_of_the_trajectory(alone: Place) -> None:
     """It is handed the trajectory's own record among those of the logs, which must not seem to be a trajectory log."""
     material = Material(Session(Survey.load(alone.file), alone.store))
@@ -131,6 +134,7 @@ def test_the_report_tells_of_the_trajectory(alone: Place) -> None:
     assert any("poses by the smoother" in line for line in lines)
 
 
+@pytest.mark.slow
 def test_status_tells_of_the_trajectory(alone: Place) -> None:
     assert alone.do("status") == 0
     (line,) = [one for one in alone.said.splitlines() if one.startswith("trajectory of run")]
@@ -147,6 +151,7 @@ def test_status_tells_of_the_trajectory(alone: Place) -> None:
     assert "not doubted" in line and line.endswith(f"picture {PICTURE}")
 
 
+@pytest.mark.slow
 @pytest.mark.witness("computed_poses")
 def test_doubt_stays_in_status(driven: tuple[Path, Path], tmp_path: Path) -> None:
     """Heights that scatter five times more than their σ says, and are believed."""
@@ -182,6 +187,7 @@ def flipped(file: Path) -> None:
     file.write_bytes(content)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", [removed, flipped])
 def test_a_damaged_picture_is_seen_and_drawn_again(alone: Place, damage: Callable[[Path], None]) -> None:
     """The same bytes come back, and nothing is solved for them."""
@@ -199,6 +205,7 @@ def test_a_damaged_picture_is_seen_and_drawn_again(alone: Place, damage: Callabl
     assert alone.do("verify") == 0
 
 
+@pytest.mark.slow
 def test_the_picture_of_a_run_that_is_no_more_goes(driven: tuple[Path, Path], tmp_path: Path) -> None:
     place = survey_of(tmp_path, *driven)
     assert place.do("run", "--workers", "0") == 0
@@ -208,6 +215,7 @@ def test_the_picture_of_a_run_that_is_no_more_goes(driven: tuple[Path, Path], tm
     assert not place.store.exists(PICTURE)
 
 
+@pytest.mark.slow
 def test_noise_that_was_measured_stands_in_the_record(alone: Place) -> None:
     (record,) = [r for r in read_log_records(alone.store) if r.sensor == "navigation"]
     assert isinstance(record.attributes["measured_noise"], dict)

@@ -190,6 +190,7 @@ def test_a_good_trajectory_stays_as_it_is() -> None:
         assert np.array_equal(found.trajectory.position_world_m, noisy)
 
 
+@pytest.mark.slow
 def test_filled_gaps_state_an_honest_sigma() -> None:
     """Gaps of 1 to 6 s at many places: errors in the middle, divided by their σ, have about unit variance."""
     epochs, position, attitude = truth()
@@ -246,6 +247,7 @@ def test_outage_that_ends_before_it_begins() -> None:
         smoothed(before, SplineConfig(), [(int(epochs[500]), int(epochs[100]))])
 
 
+@pytest.mark.slow
 def test_forward_filter_of_the_recorded_drive(recordings: Path) -> None:
     """Eleven outages of 15 s: greatest horizontal error of each, of a real-time filter before and after."""
     imu, gnss, _, vehicle = recorded_drive(recordings)

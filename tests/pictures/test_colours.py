@@ -154,6 +154,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
     return Drive(simulated, simulated.store())
 
 
+@pytest.mark.slow
 def test_vertices_have_the_colour_of_the_ground(drive: Drive) -> None:
     files, told, lines = drive.usual
     seen, right = right_share(files)
@@ -173,6 +174,7 @@ def test_vertices_have_the_colour_of_the_ground(drive: Drive) -> None:
     assert grey.keys() == files.keys() and 0.9 * told["unseen"] <= unseen <= told["unseen"]  # some have no triangle
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", [
     {f"{CAMERA}__boresight__heading_deg": -7.0, f"{CAMERA}__lever_arm_body_m": (0.9, 0.25, -1.15)},
     {f"{CAMERA}__boresight__pitch_deg": -27.0}, {f"{CAMERA}__axes": "rfu"},
@@ -181,6 +183,7 @@ def test_a_wrong_sign_shows(drive: Drive, wrong: dict[str, object]) -> None:
     assert right_share(drive.run(drive.survey(**wrong)))[1] < 0.95
 
 
+@pytest.mark.slow
 def test_neighbours_agree_and_workers_change_no_byte(drive: Drive, monkeypatch: pytest.MonkeyPatch) -> None:
     files = drive.usual[0]
     place, colour = (np.concatenate(a) for a in zip(*map(vertices, files.values()), strict=True))
@@ -198,6 +201,7 @@ def test_neighbours_agree_and_workers_change_no_byte(drive: Drive, monkeypatch: 
     assert drive.run(drive.survey()) == files
 
 
+@pytest.mark.slow
 def test_glb_has_the_same_colours_linear(drive: Drive) -> None:
     plain = drive.usual[0]
     bright = drive.run(drive.survey(COLOURED | {"format": "glb"}))
@@ -213,6 +217,7 @@ def test_glb_has_the_same_colours_linear(drive: Drive) -> None:
     assert len(bright) == len(plain)
 
 
+@pytest.mark.slow
 def test_damaged_pictures_cost_themselves(drive: Drive, tmp_path: Path) -> None:
     whole, before, _ = drive.usual
     names = sorted(p.name for p in drive.pictures.glob("*.png"))
@@ -235,6 +240,7 @@ def test_damaged_pictures_cost_themselves(drive: Drive, tmp_path: Path) -> None:
     drive.run(drive.survey(), stages=INGEST)
 
 
+@pytest.mark.slow
 def test_the_own_vehicle_colours_nothing(drive: Drive) -> None:
     lower = ((0.0, 100.0), (WIDTH, 100.0), (WIDTH, HEIGHT), (0.0, HEIGHT))
     files = drive.run(drive.survey(**{f"{CAMERA}__own_vehicle_px": [lower]}))
@@ -242,6 +248,7 @@ def test_the_own_vehicle_colours_nothing(drive: Drive) -> None:
     assert right_share(files, 0.25)[1] > 0.98
 
 
+@pytest.mark.slow
 def test_tiles_that_a_picture_may_show_depend_on_it(drive: Drive) -> None:
     def keys(options: dict[str, object] = COLOURED, **changes: object) -> dict[str, str]:
         planned = plan_surface_work(Session(drive.survey(options, **changes), drive.store)).planned
@@ -257,6 +264,7 @@ def test_tiles_that_a_picture_may_show_depend_on_it(drive: Drive) -> None:
         assert all(usual[t] != key for t, key in keys(**change).items())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("options", "changes", "message"), [
     ({}, {"rig__sensors__camera__kind": "lidar"}, "the rig has no camera"),
     ({}, {"rig__sensors__camera__interior": None}, "no interior orientation"),
@@ -272,6 +280,7 @@ def test_what_cannot_be_coloured(
         run_stages(Session(survey, drive.store, Inline(), None, Lines()), [s for s in stages() if s.name == stage])
 
 
+@pytest.mark.slow
 def test_pictures_that_are_gone(drive: Drive) -> None:
     aside = drive.pictures.with_name("aside")
     drive.pictures.rename(aside)

@@ -36,6 +36,7 @@ def smoothed(picture: np.ndarray) -> np.ndarray:
     return np.asarray(cv2.GaussianBlur(picture, (0, 0), 0.8), np.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scale", "turn", "shear"), [(1.0, 0.0, 0.0), (1.15, 0.05, 0.1), (0.9, -0.05, -0.08)])
 def test_places_are_found_to_a_few_hundredths_of_a_pixel(scale: float, turn: float, shear: float) -> None:
     rng = np.random.default_rng(7)

@@ -73,6 +73,7 @@ def targets(file: Path, out: Path, *options: str) -> tuple[list[dict[str, str]],
         return list(csv.DictReader(stream)), told.output
 
 
+@pytest.mark.slow
 def test_middles_are_found_to_a_tenth_of_a_pixel(yard: Path, tmp_path: Path) -> None:
     rows, told = targets(yard, tmp_path / "found.csv")
     known, files = Truth(yard.parent), [row["file"] for row in Truth(yard.parent).rows()]
@@ -93,6 +94,7 @@ def test_middles_are_found_to_a_tenth_of_a_pixel(yard: Path, tmp_path: Path) -> 
     assert f"{len(rows)} measurements" in told
 
 
+@pytest.mark.slow
 def test_poses_that_are_off_by_decimetres_change_nothing(yard: Path) -> None:
     """Poses off by 0.2 m and 0.3° (1 σ, each axis of each picture): the same middles, within their σ."""
     survey = Survey.load(yard)
@@ -132,6 +134,7 @@ def test_poses_that_are_off_by_decimetres_change_nothing(yard: Path) -> None:
     assert np.abs(away).max() < 0.3 and np.sqrt(np.mean(np.square(away))) < 0.1
 
 
+@pytest.mark.slow
 def test_where_there_is_no_target_none_is_found(yard: Path, tmp_path: Path) -> None:
     """The same street without targets, the same control points: bricks, windows and paint are no targets."""
     bare = YARD.changed(road={"targets": []}, roadside={"targets": []})
@@ -145,6 +148,7 @@ def test_where_there_is_no_target_none_is_found(yard: Path, tmp_path: Path) -> N
     assert told.count("run-1/camera/") >= 9, "no reasons are told"
 
 
+@pytest.mark.slow
 def test_found_targets_are_read_again_and_give_the_mounting(yard: Path, tmp_path: Path) -> None:
     found = yard.parent / "found.csv"
     rows, _ = targets(yard, found)
@@ -163,6 +167,7 @@ def test_found_targets_are_read_again_and_give_the_mounting(yard: Path, tmp_path
     assert {one.measured.point for one in report.checks} <= {"P3", "P4"}
 
 
+@pytest.mark.slow
 def test_what_is_wrong_in_measurements_is_named_and_counted(yard: Path) -> None:
     lines = ["000000.jpg,P1,1,2,run-1,", "000000.jpg,P1,3,4,,", "000009.jpg,P1,5,6,,", "000000.jpg,P2,5,6,run-7,"]
     lines.append("000000.jpg,P1,7,8,,found")  # what a person measured last counts
@@ -181,6 +186,7 @@ def test_what_is_wrong_in_measurements_is_named_and_counted(yard: Path) -> None:
     assert any("P1 stands twice" in note for note in table.notes)
 
 
+@pytest.mark.slow
 def test_a_picture_that_cannot_be_read_costs_itself(yard: Path) -> None:
     survey = Survey.load(yard)
     plan = plan_without_readings(survey, Store(survey.store_url, survey.config.id))

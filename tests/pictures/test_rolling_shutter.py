@@ -121,6 +121,7 @@ def _placed(folder: Path) -> Pictures:
     return plan_pictures(plan, PictureRule((), 50.0, -90.0, 1))
 
 
+@pytest.mark.slow
 def test_check_points_and_views_fit_by_their_rows(street: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(street, tmp_path / "right")
     left = _left_px(folder)
@@ -146,6 +147,7 @@ def test_check_points_and_views_fit_by_their_rows(street: Path, tmp_path: Path) 
     assert max(passed) < 1e-3
 
 
+@pytest.mark.slow
 def test_a_row_time_that_is_wrong_is_estimated(street: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(street, tmp_path / "wrong")
     rig = (folder / "RIG.toml").read_text()
@@ -155,6 +157,7 @@ def test_a_row_time_that_is_wrong_is_estimated(street: Path, tmp_path: Path) -> 
     assert np.sqrt(np.mean(left**2)) < 1.0
 
 
+@pytest.mark.slow
 def test_a_focal_length_that_is_3_percent_wrong_is_told(street: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(street, tmp_path / "lens")
     rig, stated = (folder / "RIG.toml").read_text(), "focal_px = [490.0, 490.0]"

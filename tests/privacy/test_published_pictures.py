@@ -74,6 +74,7 @@ def outlines(drive: Drive, file: str) -> dict[str, tuple[float, float, float, fl
     return found
 
 
+@pytest.mark.slow
 def test_what_stands_there_is_hidden_in_every_picture(street: Drive, blurred: Published) -> None:
     assert not blurred.failures
     told = json.loads((blurred.folder / "pictures" / "privacy.json").read_bytes())
@@ -99,6 +100,7 @@ def test_what_stands_there_is_hidden_in_every_picture(street: Drive, blurred: Pu
     assert seen == {"car"}
 
 
+@pytest.mark.slow
 def test_originals_stay_where_they_are(street: Drive, blurred: Published) -> None:
     raw = {file_digest(file) for file in (street.survey_file.parent / "raw").rglob("*.jpg")}
     assert raw.isdisjoint(file_digest(file) for file in blurred.folder.rglob("*") if file.is_file())
@@ -107,6 +109,7 @@ def test_originals_stay_where_they_are(street: Drive, blurred: Published) -> Non
     assert entry["pictures"]["pictures"] == len(street.poses)
 
 
+@pytest.mark.slow
 def test_the_same_bytes_again(street: Drive, blurred: Published, tmp_path: Path) -> None:
     material = Material(stated(street, '\n[privacy]\npictures = "blur"\n'), Wishes(clouds=False))
     again = publish(material, tmp_path / "site")
@@ -117,6 +120,7 @@ def test_the_same_bytes_again(street: Drive, blurred: Published, tmp_path: Path)
     assert renewed.made == 0
 
 
+@pytest.mark.slow
 def test_nothing_is_published_without_a_statement(street: Drive, tmp_path: Path) -> None:
     told = CliRunner().invoke(app, ["publish", str(street.survey_file), "--out", str(tmp_path / "site"), "--no-clouds"])
     assert told.exit_code == 0 and "note: no picture is published" in told.output
@@ -135,6 +139,7 @@ def test_nothing_is_published_without_a_statement(street: Drive, tmp_path: Path)
     assert here is not None and here.file.read_bytes() == (raw / "000000.jpg").read_bytes()
 
 
+@pytest.mark.slow
 def test_what_a_network_finds_is_hidden(street: Drive, tmp_path: Path) -> None:
     one = Drive(street.copy_with_store_to(tmp_path / "survey").survey_file)
     raw = one.survey_file.parent / "raw" / "run-1" / "camera"

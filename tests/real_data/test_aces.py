@@ -70,6 +70,7 @@ def cells(points: pd.DataFrame) -> int:
     return len(np.unique(column * 1_000_000 + row))
 
 
+@pytest.mark.slow
 def test_every_reading_is_accounted_for(place: Place, aces: Path, recorded: np.ndarray) -> None:
     assert recorded.shape == (7_374, 184)
     status = survey_status(Session(Survey.load(aces), place.store(aces)))
@@ -81,6 +82,7 @@ def test_every_reading_is_accounted_for(place: Place, aces: Path, recorded: np.n
     assert status.readings["kept"] == (ranges <= 30.0).sum()
 
 
+@pytest.mark.slow
 def test_points_lie_where_plain_trigonometry_puts_them(points: pd.DataFrame, recorded: np.ndarray) -> None:
     expected = expected_points(recorded)
     assert len(points) == len(expected) > 1_300_000
@@ -94,12 +96,14 @@ def test_points_lie_where_plain_trigonometry_puts_them(points: pd.DataFrame, rec
     assert np.abs(found[:, 1] - wanted[:, 1]).max() < 1.5e-4
 
 
+@pytest.mark.slow
 def test_walls_coincide(points: pd.DataFrame, recorded: np.ndarray) -> None:
     """Beams taken the other way round smear the building over nearly twice as many cells."""
     right, wrong = cells(points), cells(expected_points(recorded, turning=-1))
     assert right < 0.65 * wrong
 
 
+@pytest.mark.slow
 def test_relations_are_reproduced(place: Place, aces: Path) -> None:
     """1,189 relations are of poses less than 30 s apart, 90 close a loop; odometry drifts by up to 19 m.
 

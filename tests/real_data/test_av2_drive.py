@@ -20,6 +20,7 @@ def points(place: Place, av2: Path) -> pd.DataFrame:
     return read_points(place.products(av2))
 
 
+@pytest.mark.slow
 def test_ground_returns_lie_on_the_citys_raster(place: Place, points: pd.DataFrame) -> None:
     """Published: median −0.006 m, median absolute deviation 0.026 m."""
     above = ground_raster.ground(ground_raster.differences(points, place.recordings / "av2_drive"))
@@ -28,6 +29,7 @@ def test_ground_returns_lie_on_the_citys_raster(place: Place, points: pd.DataFra
     assert ground_raster.deviation(above) <= 0.03
 
 
+@pytest.mark.slow
 def test_every_return_is_where_its_sweeps_pose_puts_it(place: Place, points: pd.DataFrame) -> None:
     folder = place.recordings / "av2_drive"
     poses = pd.read_feather(folder / "city_SE3_egovehicle.feather").set_index("timestamp_ns")

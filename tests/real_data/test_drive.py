@@ -13,6 +13,7 @@ from roadscan.store.query.sql import query
 from tests.real_data.conftest import Place
 
 
+@pytest.mark.slow
 def test_the_recorded_drive_through_the_survey_file(place: Place) -> None:
     file = place.folder / "drive.toml"
     lines = place.run(file, "ingest", "navigate")

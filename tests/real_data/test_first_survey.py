@@ -32,6 +32,7 @@ def argoverse(recordings: Path, tmp_path: Path) -> Path:
     return survey_file
 
 
+@pytest.mark.slow
 def test_argoverse_lies_on_the_citys_raster(argoverse: Path, recordings: Path) -> None:
     done = roadscan("run", argoverse, "--workers", "0")
     assert done.exit_code == 0, done.output
@@ -43,6 +44,7 @@ def test_argoverse_lies_on_the_citys_raster(argoverse: Path, recordings: Path) -
     assert ground_raster.deviation(above) <= 0.03  # published: 0.026 m
 
 
+@pytest.mark.slow
 def test_the_real_lever_arm_of_argoverse_is_refused(argoverse: Path, recordings: Path) -> None:
     """It is applied already: once more, it would lift the ground by 1.64 m."""
     mountings = pd.read_feather(recordings / "av2_drive" / "calibration" / "egovehicle_SE3_sensor.feather")
@@ -66,6 +68,7 @@ def test_the_real_lever_arm_of_argoverse_is_refused(argoverse: Path, recordings:
         assert roadscan("run", argoverse, "--dry-run").exit_code == 0
 
 
+@pytest.mark.slow
 def test_a_robots_scans_make_the_building(recordings: Path, tmp_path: Path) -> None:
     """The log itself says that its scanner stands upright: x up, y right, z ahead."""
     logs = tmp_path / "logs"

@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pyarrow.parquet as pq
+import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -118,6 +119,7 @@ def _turn_of_opencv(recording: Path) -> np.ndarray:
     return cv2.recoverPose(essential, one, other, matrix, mask=kept)[1]
 
 
+@pytest.mark.slow
 def test_three_photographs_are_oriented_by_two_surveyed_points(place: Place, tmp_path: Path) -> None:
     recording = place.recordings / "pictures/berlin"
     file = _survey(recording, tmp_path)

@@ -30,6 +30,7 @@ def drive(place: Place, recording: Path, tmp_path_factory: pytest.TempPathFactor
     return file, place.run(file)
 
 
+@pytest.mark.slow
 def test_tie_points_improve_the_poses(recording: Path, drive: tuple[Path, list[str]]) -> None:
     file, _ = drive
     stated = picture_drive.disturbed(picture_drive.true_poses(recording), *ERRORS, 10)
@@ -41,6 +42,7 @@ def test_tie_points_improve_the_poses(recording: Path, drive: tuple[Path, list[s
     assert np.median(after[1]) < 0.05 < np.median(before[1])
 
 
+@pytest.mark.slow
 def test_what_is_left_is_a_fraction_of_a_pixel(place: Place, drive: tuple[Path, list[str]]) -> None:
     file, said = drive
     rows = pq.read_table(next(place.products(file).glob("tables/picture_residuals/*.parquet"))).to_pandas()
@@ -50,6 +52,7 @@ def test_what_is_left_is_a_fraction_of_a_pixel(place: Place, drive: tuple[Path, 
     assert any(f"{COUNT} of {COUNT} pictures take part" in line for line in said)
 
 
+@pytest.mark.slow
 def test_a_second_run_makes_nothing(place: Place, drive: tuple[Path, list[str]]) -> None:
     file, _ = drive
     tables = sorted(place.products(file).glob("tables/**/*.parquet"))
@@ -58,10 +61,12 @@ def test_a_second_run_makes_nothing(place: Place, drive: tuple[Path, list[str]])
     assert {one: (one.stat().st_mtime_ns, one.read_bytes()) for one in tables} == before
 
 
+@pytest.mark.slow
 def test_right_lens_and_stamps_are_not_doubted(drive: tuple[Path, list[str]]) -> None:
     assert not [line for line in drive[1] if "say of the lens" in line or "if stamps are" in line]
 
 
+@pytest.mark.slow
 @pytest.mark.witness("picture_lens")
 def test_a_wrong_lens_is_told(place: Place, recording: Path, tmp_path: Path) -> None:
     file = picture_drive.laid_out(recording, tmp_path, ERRORS, 10, CHOSEN)
@@ -70,6 +75,7 @@ def test_a_wrong_lens_is_told(place: Place, recording: Path, tmp_path: Path) -> 
     assert any("say of the lens: distortion k1 +0.0" in line for line in place.run(file))
 
 
+@pytest.mark.slow
 @pytest.mark.witness("picture_stamps")
 def test_stamps_of_the_pictures_before_are_told(place: Place, recording: Path, tmp_path: Path) -> None:
     file = picture_drive.laid_out(recording, tmp_path, ERRORS, 10, range(8, 30))
@@ -78,6 +84,7 @@ def test_stamps_of_the_pictures_before_are_told(place: Place, recording: Path, t
     assert any("if stamps are early by 1 picture;" in line for line in place.run(file))
 
 
+@pytest.mark.slow
 @pytest.mark.witness("odd_pictures")
 def test_bad_pictures_are_named_and_the_others_go_on(place: Place, recording: Path, tmp_path: Path) -> None:
     file = picture_drive.laid_out(recording, tmp_path, ERRORS, 10, range(8))
@@ -92,6 +99,7 @@ def test_bad_pictures_are_named_and_the_others_go_on(place: Place, recording: Pa
     assert "5 of 7 pictures take part" in said
 
 
+@pytest.mark.slow
 @pytest.mark.witness("pictures_wrong_way")
 def test_a_camera_that_looks_the_other_way_is_told(place: Place, recording: Path, tmp_path: Path) -> None:
     file = picture_drive.laid_out(recording, tmp_path, ERRORS, 10, range(14, 22))
@@ -100,6 +108,7 @@ def test_a_camera_that_looks_the_other_way_is_told(place: Place, recording: Path
     assert any("lie behind the camera" in line for line in place.run(file))
 
 
+@pytest.mark.slow
 @pytest.mark.witness("picture_fit")
 def test_stamps_of_other_pictures_are_told(place: Place, recording: Path, tmp_path: Path) -> None:
     file = picture_drive.laid_out(recording, tmp_path, ERRORS, 10, range(14, 22))

@@ -23,6 +23,7 @@ def round_tripped(place: Place, survey_file: Path, steps: dict[str, float]) -> p
     return round_trip.in_order(pd.concat([round_trip.recorded(tile, steps) for tile in tiles]))
 
 
+@pytest.mark.slow
 def test_nothing_is_lost(place: Place, strips_las: Path) -> None:
     original = round_trip.in_order(round_trip.recorded(strips_las, STEPS))
     assert len(original) == 14_408

@@ -71,6 +71,7 @@ def pictures(place: Place, recording: Path, tmp_path_factory: pytest.TempPathFac
     return picture_drive.placed(file)
 
 
+@pytest.mark.slow
 def test_frames_give_the_poses_that_pictures_give(
     place: Place, recording: Path, tmp_path: Path, pictures: np.ndarray
 ) -> None:
@@ -86,6 +87,7 @@ def test_frames_give_the_poses_that_pictures_give(
     assert len(listed.placed[0]) == len(SHOWN) and not listed.unplaced
 
 
+@pytest.mark.slow
 @pytest.mark.witness("damaged_frames")
 def test_a_damaged_frame_costs_that_frame(
     place: Place, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

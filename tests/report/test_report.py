@@ -80,6 +80,7 @@ def test_a_run_writes_a_page_that_needs_nothing_else(finished: Simulated) -> Non
     assert len(read.of("rect")) == sum(1 for r in Manifest(finished.store()).of("tile").values() if r.path)
 
 
+@pytest.mark.slow
 @drawn()
 def test_the_same_store_gives_the_same_page(finished: Simulated) -> None:
     session = Session.open(finished.survey_file)
@@ -135,6 +136,7 @@ def test_every_section_has_a_place_of_its_own() -> None:
     assert len(set(positions)) == len(positions)
 
 
+@pytest.mark.slow
 def test_a_browser_shows_the_page_and_asks_nobody(finished: Simulated, tmp_path: Path) -> None:
     chromium = shutil.which("chromium")
     if chromium is None:

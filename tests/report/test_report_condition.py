@@ -47,6 +47,7 @@ def page_of(survey_file: Path) -> str:
     return unescape(page)
 
 
+@pytest.mark.slow
 def test_captions_say_what_is_shown(survey_file: Path) -> None:
     captions = re.findall(r"<figcaption>(.*?)</figcaption>", page_of(survey_file), re.DOTALL)
     crossings = [one for one in captions if "typical and at its deepest rut" in one]
@@ -56,6 +57,7 @@ def test_captions_say_what_is_shown(survey_file: Path) -> None:
     assert sum("shaded relief" in one for one in captions) == 1  # the same picture as TIFF and PNG is shown once
 
 
+@pytest.mark.slow
 def test_tables_of_condition_fit_the_page(survey_file: Path) -> None:
     """Means stand with σ; remarks have numbers, and a column without a value is named below in place of dashes."""
     page = page_of(survey_file)
@@ -69,6 +71,7 @@ def test_tables_of_condition_fit_the_page(survey_file: Path) -> None:
     assert "crack_alligator_m" not in section
 
 
+@pytest.mark.slow
 @pytest.mark.witness("condition_not_measured")
 def test_what_condition_does_not_make_is_said(survey_file: Path) -> None:
     told = json.loads(roadscan("run", survey_file, "--workers", "0", "--json").stdout)
@@ -78,6 +81,7 @@ def test_what_condition_does_not_make_is_said(survey_file: Path) -> None:
     assert NOT_MEASURED in roadscan("status", survey_file).output.replace("\n", " ").replace("  ", " ")
 
 
+@pytest.mark.slow
 def test_few_check_points_make_no_statement(survey_file: Path) -> None:
     page = page_of(survey_file)
     (path,) = survey_file.parent.glob("store/*/tables/absolute_accuracy/*.parquet")
@@ -88,6 +92,7 @@ def test_few_check_points_make_no_statement(survey_file: Path) -> None:
     assert "NSSDA takes 20 at least, ASPRS (2023) 30" in page
 
 
+@pytest.mark.slow
 def test_residuals_that_contradict_their_sigma_are_named(survey_file: Path, tmp_path: Path) -> None:
     """The same survey, with residuals of its control points as those of poses that err by 50 mm."""
     copy = tmp_path / "survey"
@@ -146,6 +151,7 @@ def test_no_pothole_and_no_noise_is_shown_as_a_rut() -> None:
     assert chosen_ruts(station, np.full_like(depths, np.nan), sigmas) == {}
 
 
+@pytest.mark.slow
 @pytest.mark.witness("rough_readings")
 def test_paint_that_is_not_sought_is_said(tmp_path: Path) -> None:
     """A lidar that errs by 200 mm hides the paint; that no lane line is found is no proof that there is none."""

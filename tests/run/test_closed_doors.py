@@ -67,12 +67,14 @@ def accepted(address: str, security: Security | None) -> bool:
         return False
 
 
+@pytest.mark.slow
 def test_all_of_it_listens_on_loopback_alone(opened: Opened) -> None:
     """A port each for the scheduler, two nannies and two workers, and none that serves pages."""
     assert {ip for ip, _ in opened.ports} == {"127.0.0.1"}
     assert len(opened.ports) == 5
 
 
+@pytest.mark.slow
 def test_only_the_clusters_own_key_is_let_in(opened: Opened) -> None:
     own, another = opened.cluster.security, Security.temporary()
     half = Security(require_encryption=True, tls_ca_file=own.tls_ca_file, tls_client_cert=another.tls_client_cert,
@@ -84,6 +86,7 @@ def test_only_the_clusters_own_key_is_let_in(opened: Opened) -> None:
         assert not accepted(f"tls://{ip}:{port}", half)
 
 
+@pytest.mark.slow
 def test_the_key_lies_nowhere(opened: Opened, capfd: pytest.CaptureFixture[str]) -> None:
     """Neither on a command line nor in an environment, a file or a log."""
     lines = opened.cluster.security.tls_worker_key.splitlines()
@@ -115,6 +118,7 @@ def scratch(opened: Opened) -> Path:
     return Path(opened.cluster.scheduler.local_directory).parents[1]
 
 
+@pytest.mark.slow
 def test_code_that_waits_in_dasks_usual_folder_is_not_loaded(tmp_path: Path) -> None:
     """Another user may have made that folder first, with modules in it that the run or its libraries ask for."""
     usual = tmp_path / "dask-scratch-space"

@@ -83,6 +83,7 @@ def edited(tmp_path: Path, finished: Simulated) -> Callable[..., tuple[int, int,
     return status
 
 
+@pytest.mark.slow
 def test_what_is_added_leaves_every_output_current(edited: Callable[..., tuple[int, int, int, bool]]) -> None:
     kernel = "from roadscan.compute.kernel_options import kernel\n\n\n@kernel\ndef another(x):\n    return x\n"
     assert edited(
@@ -95,6 +96,7 @@ def test_what_is_added_leaves_every_output_current(edited: Callable[..., tuple[i
     ) == (0, 0, 0, True)
 
 
+@pytest.mark.slow
 def test_a_change_of_a_cells_statistics_makes_the_tiles_stale(
     edited: Callable[..., tuple[int, int, int, bool]], finished: Simulated
 ) -> None:
@@ -103,6 +105,7 @@ def test_a_change_of_a_cells_statistics_makes_the_tiles_stale(
     assert tiles == tiles_of(finished)
 
 
+@pytest.mark.slow
 def test_a_change_of_a_product_makes_its_files_stale_alone(edited: Callable[..., tuple[int, int, int, bool]]) -> None:
     footprints, tiles, products, complete = edited(("tiles/products/tile_table.py", r"\Z", "\n"))
     assert (footprints, tiles, products, complete) == (0, 0, 0, True)
@@ -110,6 +113,7 @@ def test_a_change_of_a_product_makes_its_files_stale_alone(edited: Callable[...,
     assert edited(changed)[:3] == (0, 0, 1)
 
 
+@pytest.mark.slow
 def test_a_change_of_placing_makes_footprints_and_tiles_stale(
     edited: Callable[..., tuple[int, int, int, bool]], finished: Simulated
 ) -> None:

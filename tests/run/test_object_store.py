@@ -73,6 +73,7 @@ def run(survey: Survey, store: Store, *chosen: TileId) -> Session:
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "why"), [(ConnectionResetError("reset"), "a place does not answer"), (ValueError("bad"), "")]
 )
@@ -89,6 +90,7 @@ def test_a_unit_that_met_a_silent_store_may_pass(
     assert may_pass(failed.value) == why
 
 
+@pytest.mark.slow
 def test_a_whole_run(finished: Simulated, objects: str) -> None:
     survey, folder = Survey.load(finished.survey_file), finished.store()
     store = Store(objects, survey.config.id)
@@ -112,6 +114,7 @@ def test_a_whole_run(finished: Simulated, objects: str) -> None:
     assert store.files("damaged") == [f"damaged/{part}"]
 
 
+@pytest.mark.slow
 def test_an_idle_run_lists_s3_once(finished: Simulated) -> None:
     """What the run knows of the store at its end is what the store holds, and a second run asks for records alone."""
     survey = Survey.load(finished.survey_file)

@@ -57,6 +57,7 @@ def test_rows_of_archived_logs_stay(
     assert {log["state"] for log in state.logs} == {"ingested"}
 
 
+@pytest.mark.slow
 def test_an_older_store_is_read_and_made_again(survey_file: Path) -> None:
     session = Session.open(survey_file)
     faults = verify_store(session.store)
@@ -83,6 +84,7 @@ def test_an_older_store_is_read_and_made_again(survey_file: Path) -> None:
     assert tuple(tiles.values()) == TILES
 
 
+@pytest.mark.slow
 def test_a_newer_store_is_refused_by_name(finished: Simulated, tmp_path: Path) -> None:
     """Before long work, by each command that writes; what only looks says it too."""
     copy = finished.copy_with_store_to(tmp_path / "survey")

@@ -33,6 +33,7 @@ def cluster() -> Iterator[OnDask]:
             yield opened
 
 
+@pytest.mark.slow
 def test_only_the_task_that_kills_its_worker_is_lost(cluster: OnDask) -> None:
     ended = {done.task: done for done in cluster.map(squared, range(20))}
     assert sorted(ended) == list(range(20))
@@ -42,6 +43,7 @@ def test_only_the_task_that_kills_its_worker_is_lost(cluster: OnDask) -> None:
     assert {task: done.result for task, done in ended.items()} == {task: task**2 for task in ended}
 
 
+@pytest.mark.slow
 def test_a_task_is_told_with_the_worker_that_did_it(cluster: OnDask) -> None:
     heard: list[UnitEnded] = []
     listener = Listener()
@@ -69,6 +71,7 @@ def test_a_result_that_cannot_be_sent_is_its_tasks_error(cluster: OnDask, made: 
     assert ended["sound"].result == "sound"
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_dies_while_it_is_asked_is_named(tmp_path: Path) -> None:
     told = tmp_path / "scheduler.json"
     words = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0"]
@@ -84,6 +87,7 @@ def test_a_scheduler_that_dies_while_it_is_asked_is_named(tmp_path: Path) -> Non
                 asked.workers  # noqa: B018 — asking is what is tried
 
 
+@pytest.mark.slow
 def test_workers_that_are_gone_for_good_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compute_on, "_LOST_S", 0.5)
     with embedded(1) as alone:
@@ -93,6 +97,7 @@ def test_workers_that_are_gone_for_good_are_replaced(monkeypatch: pytest.MonkeyP
         assert [done.result for done in alone.map(squared, [3])] == [9]
 
 
+@pytest.mark.slow
 def test_a_worker_of_another_version_that_joins_later_does_no_task(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

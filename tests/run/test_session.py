@@ -45,6 +45,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     return counts
 
 
+@pytest.mark.slow
 def test_a_whole_run_plans_once(simulated: Simulated, tmp_path: Path, counted: Counter[str]) -> None:
     copy = simulated.copy_to(tmp_path / "survey")
     run_stages(Session.open(copy.survey_file))

@@ -74,6 +74,7 @@ def of(events: list[dict[str, Any]], kind: str, stage: str | None = None) -> lis
     return [one for one in events if one["event"] == kind and stage in (None, one["stage"])]
 
 
+@pytest.mark.slow
 def test_every_stage_begins_and_ends_once_within_the_run(events: list[dict[str, Any]]) -> None:
     assert (events[0]["event"], events[-1]["event"]) == ("run_began", "run_ended")
     assert events[0]["stages"] == ALL_STAGES
@@ -87,6 +88,7 @@ def test_every_stage_begins_and_ends_once_within_the_run(events: list[dict[str, 
     assert taken_s <= events[-1]["seconds"] <= (instants[-1] - instants[0]).total_seconds() + 0.01
 
 
+@pytest.mark.slow
 def test_units_are_the_logs_and_the_tiles(told: Simulated, events: list[dict[str, Any]]) -> None:
     raw = [file for file in told.survey_file.parent.rglob("*") if file.suffix in {".parquet", ".sbet", ".csv", ".pcap"}]
     logs = Counter(file.name for file in raw if "store" not in file.parts and "truth" not in file.parts)
@@ -98,6 +100,7 @@ def test_units_are_the_logs_and_the_tiles(told: Simulated, events: list[dict[str
     assert {one["outcome"] for one in of(events, "unit_ended")} == {"done"}
 
 
+@pytest.mark.slow
 def test_bytes_written_are_those_of_the_files(told: Simulated, events: list[dict[str, Any]]) -> None:
     """Sizes as the file system states them; a stage writes records of the manifest beside its files, too."""
     store = told.store()
@@ -145,6 +148,7 @@ def test_an_error_brings_its_cost_from_a_worker() -> None:
     assert isinstance(cost, Cost) and cost.process == os.getpid() and str(sent) == str(caught.value)
 
 
+@pytest.mark.slow
 def test_history_says_what_the_events_say(told: Simulated, events: list[dict[str, Any]]) -> None:
     rows = history(told.store())
     mine = [row for row in rows if row["run"] == events[0]["run"]]
@@ -160,6 +164,7 @@ def test_history_says_what_the_events_say(told: Simulated, events: list[dict[str
     assert abs((began - dt.datetime.fromisoformat(events[0]["at_utc"])).total_seconds()) < 1.0
 
 
+@pytest.mark.slow
 def test_prometheus_reads_the_figures(told: Simulated, events: list[dict[str, Any]]) -> None:
     text = (told.survey_file.parent / "run.prom").read_text()
     found = {
@@ -175,6 +180,7 @@ def test_prometheus_reads_the_figures(told: Simulated, events: list[dict[str, An
     assert found["roadscan_run_seconds", ""] == events[-1]["seconds"]
 
 
+@pytest.mark.slow
 def test_the_board_asks_for_what_a_run_writes(told: Simulated) -> None:
     written = {f.name for f in text_string_to_metric_families((told.survey_file.parent / "run.prom").read_text())}
     asked = set(re.findall(r"roadscan_\w+", (REPOSITORY / "deploy" / "grafana.json").read_text()))
@@ -182,6 +188,7 @@ def test_the_board_asks_for_what_a_run_writes(told: Simulated) -> None:
     assert written - asked == {"roadscan_run_seconds", "roadscan_stage_tasks"}
 
 
+@pytest.mark.slow
 def test_who_listens_changes_no_output(told: Simulated, finished: Simulated, tmp_path: Path) -> None:
     """The run that told nobody made the same bytes, and after both a further run finds nothing to do."""
     assert outputs(told.store()) == outputs(finished.store())
@@ -200,6 +207,7 @@ def test_who_listens_changes_no_output(told: Simulated, finished: Simulated, tmp
     assert len(runs) == 3 and min(runs.values()) == 0 < max(runs.values())
 
 
+@pytest.mark.slow
 def test_a_failure_is_told_with_its_reason(told: Simulated, tmp_path: Path) -> None:
     broken = told.copy_with_store_to(tmp_path / "broken")
     scans = next(p for p in broken.store().files("tables/scans") if "profiler_left" in p)
@@ -216,6 +224,7 @@ def test_a_failure_is_told_with_its_reason(told: Simulated, tmp_path: Path) -> N
     assert {row["stage"] for row in rows if row["stage_outcome"] == "failed"} == {one["stage"] for one in failed}
 
 
+@pytest.mark.slow
 def test_no_flipped_bit_of_the_history_is_silent(told: Simulated, tmp_path: Path) -> None:
     copy = told.copy_with_store_to(tmp_path / "copy")
     store = copy.store()
@@ -240,6 +249,7 @@ def test_no_flipped_bit_of_the_history_is_silent(told: Simulated, tmp_path: Path
     assert CliRunner().invoke(app, ["verify", str(copy.survey_file)]).exit_code == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "told_of"),
     [
@@ -254,6 +264,7 @@ def test_a_file_that_cannot_be_written_is_refused_before_the_run(
     assert refused.exit_code != 0 and told_of in str(refused.exception)
 
 
+@pytest.mark.slow
 def test_a_full_disk_of_the_events_stops_no_run(told: Simulated, tmp_path: Path) -> None:
     copy = told.copy_with_store_to(tmp_path / "copy")
     done = run(copy, "--events", "/dev/full")
@@ -304,6 +315,7 @@ def collector(monkeypatch: pytest.MonkeyPatch) -> Iterator[Collector]:
         yield server
 
 
+@pytest.mark.slow
 def test_a_collector_gets_the_run_as_a_trace_and_its_figures(
     collector: Collector, told: Simulated, tmp_path: Path
 ) -> None:
@@ -327,6 +339,7 @@ def test_a_collector_gets_the_run_as_a_trace_and_its_figures(
     assert written == sum(one["bytes_written"] for one in of(events, "stage_ended"))
 
 
+@pytest.mark.slow
 def test_a_collector_that_is_gone_stops_no_run(
     told: Simulated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -336,6 +349,7 @@ def test_a_collector_that_is_gone_stops_no_run(
     assert run(copy).exit_code == 0
 
 
+@pytest.mark.slow
 def test_no_run_before_its_first_stage_is_in_the_history(told: Simulated, tmp_path: Path) -> None:
     """It is in its events, though: a service has to hear of it."""
     copy = told.copy_with_store_to(tmp_path / "copy")
@@ -348,6 +362,7 @@ def test_no_run_before_its_first_stage_is_in_the_history(told: Simulated, tmp_pa
     assert events[-1]["outcome"] == "failed" and events[-1]["reason"]
 
 
+@pytest.mark.slow
 def test_the_table_is_as_its_schema_says(told: Simulated) -> None:
     from roadscan.store.schema import table_schema
 

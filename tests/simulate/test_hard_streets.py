@@ -41,6 +41,7 @@ def test_seeds_give_the_same_scene_and_all_kinds():
         assert scene.noise.pass_step_m > 0.0
 
 
+@pytest.mark.slow
 def test_places_without_errors_are_those_met():
     street = seen(exact=True)
     known = street.object_id >= 0
@@ -59,6 +60,7 @@ def _sensor(street: LabelledReturns) -> np.ndarray:
     return np.stack([r.sensor_x_m, r.sensor_y_m, r.sensor_height_m], axis=-1)
 
 
+@pytest.mark.slow
 def test_stated_poses_move_the_whole_pass():
     street = seen()
     sharp = (street.object_id >= 0) & ~street.is_mixed
@@ -68,12 +70,14 @@ def test_stated_poses_move_the_whole_pass():
     assert 0.0 < street.is_mixed.mean() < 0.3
 
 
+@pytest.mark.slow
 def test_lasers_are_those_of_the_model_and_zero_on_request():
     street = seen()
     assert set(street.returns.laser) == set(range(lidar_model("VLP-16").lasers))
     assert not labelled_returns(short(), laser_numbers=False).returns.laser.any()
 
 
+@pytest.mark.slow
 def test_same_seed_same_returns():
     first, again = seen(), labelled_returns(short())
     for one in fields(first.returns):
@@ -111,6 +115,7 @@ def test_classes_of_kinds_are_classes(name):
     assert name in CLASSES
 
 
+@pytest.mark.slow
 def test_lasers_are_off_for_good_and_dark_things_are_lost():
     exact = short().noiseless()
     scene = exact.changed(lidar={"laser_range_m": 0.02, "dark_m": 25.0, "false_returns": 0.003})

@@ -120,6 +120,7 @@ def between(first: tuple[float, float], second: tuple[float, float]) -> tuple[np
     return first[0] + share * (second[0] - first[0]), first[1] + share * (second[1] - first[1])
 
 
+@pytest.mark.slow
 def test_targets_appear_where_they_are_projected(yard: Pictures):
     grey = yard.grey(0)
     contours, hierarchy = cv2.findContours((grey > 130).astype(np.uint8)[250:], cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
@@ -137,6 +138,7 @@ def test_targets_appear_where_they_are_projected(yard: Pictures):
         assert away.min() < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 1])
 def test_edges_of_stripes_appear_where_they_are_projected(yard: Pictures, number: int):
     for offset in (-0.5, 0.0, 0.5, 1.0):
@@ -145,6 +147,7 @@ def test_edges_of_stripes_appear_where_they_are_projected(yard: Pictures, number
         assert abs(edge.mean()) < 0.15
 
 
+@pytest.mark.slow
 def test_a_box_appears_where_it_stands(yard: Pictures):
     foot = yard.ground([BOX["station_m"]], [BOX["offset_m"]])[0]
     near, left, right = BOX["station_m"] - 0.6, BOX["offset_m"] - 0.4, BOX["offset_m"] + 0.4
@@ -165,6 +168,7 @@ def test_a_box_appears_where_it_stands(yard: Pictures):
     assert yard.pixels(0, foot[None])[0, 0] > 480
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 2])
 def test_a_moving_car_is_where_it_has_come_to(yard: Pictures, number: int):
     drive_s = (yard.rows[number]["epoch_gps_ns"] - yard.rows[0]["epoch_gps_ns"]) / 1e9
@@ -177,6 +181,7 @@ def test_a_moving_car_is_where_it_has_come_to(yard: Pictures, number: int):
     assert right - left == pytest.approx(1.8)
 
 
+@pytest.mark.slow
 def test_shadows_fall_away_from_the_sun(yard: Pictures):
     # The sun stands 42 degrees high, 150 degrees from north: the shadow of the box falls to the north-north-west.
     base = yard.ground([BOX["station_m"]], [BOX["offset_m"]])[0]
@@ -190,6 +195,7 @@ def test_shadows_fall_away_from_the_sun(yard: Pictures):
     assert tone[0] < 0.7 * tone[1]
 
 
+@pytest.mark.slow
 def test_the_sign_of_the_distortion_matters(yard: Pictures):
     line = yard.ground(*between((7.5, 1.0), (9.5, 1.0)))
     wrong = Pictures(yard.folder, YARD, tuple(-k for k in BARREL))
@@ -214,6 +220,7 @@ def test_a_distortion_that_folds_the_picture_over_is_refused():
         Lens.of(Camera(distortion=(-1.5, 0.0, 0.0, 0.0, 0.0))).rays([0.0, 959.0], [0.0, 599.0])
 
 
+@pytest.mark.slow
 def test_nothing_is_sky(yard: Pictures):
     grey = yard.grey(0)
     assert grey[:40].min() > 160
@@ -265,6 +272,7 @@ def log_folder(survey: Path) -> Path:
     return survey / "raw" / "run-1" / "camera"
 
 
+@pytest.mark.slow
 def test_same_scene_same_pictures_and_noise_of_the_size_stated(tmp_path: Path):
     for name in ("a", "b"):
         simulate(SMALL, tmp_path / name)

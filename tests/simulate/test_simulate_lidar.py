@@ -87,6 +87,7 @@ def test_beams_are_the_decoders():
     np.testing.assert_allclose(beams.rise_m, [float(r[2]) for r in rows], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_decoded_returns_are_the_hits(on_grid: SimulatedSurvey):
     decoded, hits = decode(on_grid.folder), true_hits(on_grid)
     assert len(decoded) == hits["range_m"].size == on_grid.returns > 50_000
@@ -106,6 +107,7 @@ def test_continuous_azimuths_are_rounded_only(tmp_path: Path):
     assert np.linalg.norm(decoded[:, :3] - in_sensor(hits), axis=1).max() < 0.003
 
 
+@pytest.mark.slow
 def test_hits_lie_on_the_surface(on_grid: SimulatedSurvey):
     hits, known = true_hits(on_grid), truth.load(on_grid.folder)
     height = known.height_m(hits["easting_m"], hits["northing_m"])
@@ -119,6 +121,7 @@ def test_hits_lie_on_the_surface(on_grid: SimulatedSurvey):
     assert offset.max() > 6.0
 
 
+@pytest.mark.slow
 def test_hits_come_back_through_the_trajectory(on_grid: SimulatedSurvey):
     hits = true_hits(on_grid)
     sensor = tomllib.loads(on_grid.rig_file.read_text())["sensors"]["lidar"]
@@ -174,6 +177,7 @@ def test_a_wrong_clock_shifts_stamps_and_sentences(tmp_path: Path):
     assert sentences == [b"100000.00,A,4", b"100001.00,A,4"]
 
 
+@pytest.mark.slow
 def test_packets_cross_objects_and_edges(tmp_path: Path):
     """Hits tell the object; what is not mixed lies where the beam's middle met it."""
     side = {"boxes": [{"station_m": 6.0, "offset_m": -1.0, "length_m": 1.0, "width_m": 1.0, "height_m": 1.0}]}
@@ -194,6 +198,7 @@ def test_packets_cross_objects_and_edges(tmp_path: Path):
     assert thin["height_m"][on_box].max() <= table["height_m"][0] + 1.0 + 1e-6
 
 
+@pytest.mark.slow
 def test_wide_beams_mix_beside_edges_only():
     """A mixed firing has another object, or nothing, beside it; and what is not mixed is what thin beams meet."""
     side = {
@@ -227,6 +232,7 @@ def test_wide_beams_mix_beside_edges_only():
     assert at_edge[is_mixed.reshape(-1, 32)[:, order]].all()
 
 
+@pytest.mark.slow
 def test_packets_by_hand(on_grid: SimulatedSurvey):
     raw = (on_grid.folder / "raw" / "run-1" / "lidar.pcap").read_bytes()
     assert struct.unpack_from("<IHHiIII", raw) == (0xA1B2C3D4, 2, 4, 0, 0, 262_144, 1)

@@ -119,6 +119,7 @@ def yard(tmp_path_factory: pytest.TempPathFactory) -> Survey:
     return Survey(simulate(YARD, tmp_path_factory.mktemp("photogrammetry") / "yard").folder)
 
 
+@pytest.mark.slow
 def test_matches_of_sift_agree_with_the_true_poses(yard: Survey):
     finder, matcher = cv2.SIFT_create(3000), cv2.BFMatcher()
     matrix, distortion = yard.lens()
@@ -145,6 +146,7 @@ def test_matches_of_sift_agree_with_the_true_poses(yard: Survey):
     assert np.median(error) < 0.3
 
 
+@pytest.mark.slow
 def test_targets_lie_where_true_poses_place_them(yard: Survey):
     marks = yard.marks()
     assert set(marks) == {"T1", "C002", "P1", "P2", "G005"}
@@ -154,6 +156,7 @@ def test_targets_lie_where_true_poses_place_them(yard: Survey):
             assert np.abs(middle(yard.picture(number), expected) - expected).max() < 0.3
 
 
+@pytest.mark.slow
 def test_the_survey_states_all_targets_with_its_errors(yard: Survey):
     with (yard.folder / "control.csv").open() as stream:
         stated = {row["name"]: row for row in csv.DictReader(stream)}
@@ -169,6 +172,7 @@ def test_the_survey_states_all_targets_with_its_errors(yard: Survey):
     assert 0.0 < np.abs(away).max() < 5 * YARD.noise.control_m
 
 
+@pytest.mark.slow
 def test_the_rig_file_states_lens_and_mounting_with_their_errors(yard: Survey):
     rig, camera = tomllib.loads((yard.folder / "RIG.toml").read_text())["sensors"]["camera"], YARD.camera
     assert rig["interior"]["focal_px"] == [492.0, 492.0]
@@ -178,6 +182,7 @@ def test_the_rig_file_states_lens_and_mounting_with_their_errors(yard: Survey):
     assert true["interior"]["focal_px"] == [490.0, 490.0] and true["boresight"]["pitch_deg"] == camera.mount.pitch_deg
 
 
+@pytest.mark.slow
 def test_brightness_is_fixed_to_the_surface_and_only_pictures_see_it(tmp_path: Path):
     even = YARD.changed(albedo={"road": None, "verge": None, "beside": None})
     lidar = {"on": True, "range_max_m": 6.0}
@@ -189,6 +194,7 @@ def test_brightness_is_fixed_to_the_surface_and_only_pictures_see_it(tmp_path: P
     assert logs[0][1] != logs[1][1]
 
 
+@pytest.mark.slow
 def test_a_moving_car_takes_its_brightness_along(tmp_path: Path):
     """A car that drives ahead at the camera's own speed looks the same in each picture; the road under it does not."""
     car = {"station_m": 8.0, "offset_m": 1.625, "speed_m_per_s": 10.0, "shade": 150.0}
@@ -206,6 +212,7 @@ def test_a_moving_car_takes_its_brightness_along(tmp_path: Path):
     assert abs(np.corrcoef(first[road].ravel(), second[road].ravel())[0, 1]) < 0.5
 
 
+@pytest.mark.slow
 def test_rows_of_a_rolling_shutter_are_exposed_one_after_another(tmp_path: Path):
     fast = {"speed_m_per_s": 27.8}
     passes, camera = [{"lane": 2, **fast}], {"line_time_us": 60.0, "stamped_row": "last"}

@@ -29,6 +29,7 @@ def hashes(folder: Path) -> dict[str, str]:
     return {str(f.relative_to(folder)): hashlib.sha256(f.read_bytes()).hexdigest() for f in files}
 
 
+@pytest.mark.slow
 def test_same_seed_same_bytes(tmp_path: Path):
     scene = TINY.changed(length_m=4.0, lidar={"on": True}, passes=[{"lane": 2}, {"lane": 1, "direction": "backward"}])
     simulate(scene, tmp_path / "a", write_hits=True)
@@ -115,6 +116,7 @@ def test_moving_cars_block_profiler_beams(monkeypatch: pytest.MonkeyPatch):
     assert (empty[3] == 0).all()
 
 
+@pytest.mark.slow
 def test_walls_hide_floors_from_a_heads_camera_and_spots_average():
     """Slots of 6 mm, 20 mm deep: the camera looks along a longitudinal one, and over the edge of a transverse one."""
     along = {"points_m": [(8.0, -1.0), (12.0, -1.0)], "width_m": 0.006, "depth_m": 0.02, "wall_m": 0.0005}
@@ -160,6 +162,7 @@ def test_row_groups_and_encoding(tmp_path: Path):
     assert column.total_compressed_size < 0.6 * 2 * 512 * 200
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_road(tmp_path: Path):
     peaks = []
     for length in (500.0, 2_000.0):

@@ -244,6 +244,7 @@ STARTS = {
 DRIFTING = {"offset_s": -0.9, "drift_ppm": 300.0, "known": True}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("crs", ["EPSG:32632", "local"])
 @pytest.mark.parametrize("start", list(STARTS))
 def test_every_log_comes_back_to_its_true_epochs(tmp_path: Path, start: str, crs: str):

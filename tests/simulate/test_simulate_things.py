@@ -134,6 +134,7 @@ def test_pole_seen_from_the_side_and_from_above():
         )
 
 
+@pytest.mark.slow
 def test_signs_round_and_square():
     signs = [
         {"station_m": 10.0, "offset_m": 5.0, "width_m": 0.8, "height_m": 0.5, "clearance_m": 1.5},
@@ -151,6 +152,7 @@ def test_signs_round_and_square():
         check(world_of(flat(signs=signs)), at, towards(at, [*place(10.0, 6.0), 1.7], 1.3, 3000), solid, 200)
 
 
+@pytest.mark.slow
 def test_tree_without_gaps_lamp_post_and_guardrail():
     scene = flat(
         lamp_posts=[{"station_m": 15.0, "offset_m": 6.0, "height_m": 5.0, "arm_m": 1.5}],
@@ -193,6 +195,7 @@ def test_parked_car_is_body_cabin_and_wheels():
     check(world_of(flat(parked_cars=[car])), at, towards(at, [*place(14.0, 3.0), 0.7], 2.5, 2500), solid, 500)
 
 
+@pytest.mark.slow
 def test_gaps_let_the_stated_share_through():
     world = world_of(flat(fences=[{"offset_m": 5.0, "start_m": 0.0, "end_m": 30.0, "height_m": 3.0, "density": 0.4}]))
     at = (*place(15.0, 0.0), 1.5)
@@ -356,6 +359,7 @@ def over_ground(surface: Surface, way: np.ndarray, share: np.ndarray) -> np.ndar
     return path[:, 2] - surface.height_m(path[:, 0], path[:, 1], texture=False)
 
 
+@pytest.mark.slow
 def test_every_hit_is_the_first_thing_in_the_way():
     """500 rays of a lidar, each walked in steps of a millimetre over the road, and past every body on its own."""
     scene, world, drive = urban()
@@ -400,6 +404,7 @@ def test_every_hit_is_the_first_thing_in_the_way():
     assert min(counted.values()) > 40, counted
 
 
+@pytest.mark.slow
 def test_blocks_change_nothing(monkeypatch: pytest.MonkeyPatch):
     scene, _, drive = urban()
     scene = scene.changed(

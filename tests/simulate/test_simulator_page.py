@@ -44,6 +44,7 @@ def test_the_short_scene_is_one():
     assert Scene.parse(load_toml(file), file=file).id == "my-street"
 
 
+@pytest.mark.slow
 def test_the_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     monkeypatch.chdir(tmp_path)
     runpy.run_path(str(DOCS / "examples" / "simulate_scene.py"))

@@ -124,6 +124,7 @@ def urls(value: Any) -> Iterator[str]:
             yield from urls(one)
 
 
+@pytest.mark.slow
 def test_every_document_that_is_named_is_there_and_every_member_is_told(published: Published) -> None:
     assert not published.failures
     entry = read(published, "survey.json")
@@ -151,6 +152,7 @@ def test_every_document_that_is_named_is_there_and_every_member_is_told(publishe
             assert {f.name for f in folder.iterdir()} == there
 
 
+@pytest.mark.slow
 def test_heights_read_back_are_those_of_the_cells(survey_file: Path, published: Published) -> None:
     session, entry = opened(survey_file), read(published, "survey.json")
     grid, level = plan_of(session).ground.grid, entry["raster_grid"]["levels"][0]
@@ -191,6 +193,7 @@ def heights_of(published: Published, level: int) -> dict[tuple[int, int], int]:
     return found
 
 
+@pytest.mark.slow
 def test_pixels_of_the_next_level_are_means_of_the_finest(published: Published) -> None:
     levels = read(published, "survey.json")["raster_grid"]["levels"]
     factor = round(levels[1]["pixel_m"] / levels[0]["pixel_m"])
@@ -229,6 +232,7 @@ def test_a_coarser_picture_is_the_mean_of_four_by_four_known_pixels(raster: Rast
                 assert out[y, x, :-1] @ weights == round(float(np.mean(known[:, :-1] @ weights)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pavement_intensity", "pavement_shaded"])
 def test_the_pavement_on_the_map_is_that_of_its_pictures(name: str, survey_file: Path, published: Published) -> None:
     """Pixel by pixel the product's own file, without the cells along the tile's border, where neighbours differ."""
@@ -257,6 +261,7 @@ def test_the_pavement_on_the_map_is_that_of_its_pictures(name: str, survey_file:
         assert raster["offset"] + 255 * raster["step"] == pytest.approx(30000.0)
 
 
+@pytest.mark.slow
 def test_a_long_lane_has_bins_and_pieces(
     survey_file: Path, published: Published, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -293,6 +298,7 @@ def test_a_long_lane_has_bins_and_pieces(
     assert binned > 3
 
 
+@pytest.mark.slow
 def test_evidence_names_what_the_site_holds(published: Published) -> None:
     entry = read(published, "survey.json")
     features = {
@@ -312,6 +318,7 @@ def test_evidence_names_what_the_site_holds(published: Published) -> None:
         assert station["station_m"] == pytest.approx(feature["properties"]["station_from_m"], abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_cloud_holds_every_point_of_the_survey_once(survey_file: Path, published: Published) -> None:
     session, index = opened(survey_file), read(published, "clouds/index.json")
     places, passes = [], []
@@ -335,6 +342,7 @@ def test_a_cloud_holds_every_point_of_the_survey_once(survey_file: Path, publish
     assert {one[:3] for one in wanted} <= set(map(tuple, whole.tolist()))
 
 
+@pytest.mark.slow
 def test_strips_hold_the_values_of_the_tables(survey_file: Path, published: Published) -> None:
     session, index = opened(survey_file), read(published, "strips/index.json")
     assert {lane["lane"] for lane in index["lanes"]} == {"1", "2"}
@@ -366,6 +374,7 @@ def test_strips_hold_the_values_of_the_tables(survey_file: Path, published: Publ
         assert height is None or height == pytest.approx(row["height_m"] + true, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_the_direction_of_travel_is_that_of_the_drive(published: Published) -> None:
     """The truth drives lane 2 forward and lane 1 backward; the passes say so."""
     index = read(published, "strips/index.json")
@@ -380,6 +389,7 @@ def test_the_direction_of_travel_is_that_of_the_drive(published: Published) -> N
     assert abs(abs(turned["backward"]) - 180.0) < 5.0
 
 
+@pytest.mark.slow
 def test_points_stand_in_pictures_where_the_true_camera_sees_them(survey_file: Path, published: Published) -> None:
     known = truth.load(survey_file.parent)
     to_world = pyproj.Transformer.from_crs(pyproj.CRS("EPSG:32632").to_3d(), "EPSG:4978", always_xy=True)
@@ -410,6 +420,7 @@ def test_points_stand_in_pictures_where_the_true_camera_sees_them(survey_file: P
     assert worst < 0.5  # pixels
 
 
+@pytest.mark.slow
 def test_the_same_survey_gives_the_same_bytes_and_nothing_is_made_twice(
     survey_file: Path, published: Published, tmp_path: Path
 ) -> None:
@@ -421,6 +432,7 @@ def test_the_same_survey_gives_the_same_bytes_and_nothing_is_made_twice(
     assert [f.name for f in tmp_path.iterdir()] == ["site"]
 
 
+@pytest.mark.slow
 def test_a_damaged_file_of_a_site_is_named_and_made_again(
     survey_file: Path, published: Published, tmp_path: Path
 ) -> None:
@@ -443,6 +455,7 @@ def test_a_damaged_file_of_a_site_is_named_and_made_again(
         publish(Material(opened(survey_file)), site)
 
 
+@pytest.mark.slow
 def test_a_damaged_tile_costs_its_pictures_and_leaves_a_hole_in_coarser_ones(
     survey_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -469,6 +482,7 @@ def test_a_damaged_tile_costs_its_pictures_and_leaves_a_hole_in_coarser_ones(
     assert [str(f) for f in sorted({*files, *again}) if files.get(f) != again.get(f)] == []
 
 
+@pytest.mark.slow
 def test_a_folder_of_something_else_is_left_alone(survey_file: Path, tmp_path: Path) -> None:
     (tmp_path / "letters.txt").write_text("dear")
     done = CliRunner().invoke(app, ["publish", str(survey_file), "--out", str(tmp_path)])
@@ -477,6 +491,7 @@ def test_a_folder_of_something_else_is_left_alone(survey_file: Path, tmp_path: P
     assert [f.name for f in tmp_path.iterdir()] == ["letters.txt"]
 
 
+@pytest.mark.slow
 def test_part_of_a_survey(survey_file: Path, published: Published, tmp_path: Path) -> None:
     west, south, east, north = read(published, "survey.json")["extent_m"]
     wishes = Wishes(clouds=False, pictures=False, finest_pixel_m=0.15, near=(west, south, west + 5.0, north))
@@ -488,6 +503,7 @@ def test_part_of_a_survey(survey_file: Path, published: Published, tmp_path: Pat
     assert not (part.folder / "clouds").exists()
 
 
+@pytest.mark.slow
 def test_strips_of_another_survey_stand_beside_those_of_this_one(
     survey_file: Path, published: Published, tmp_path: Path
 ) -> None:
@@ -508,6 +524,7 @@ def test_strips_of_another_survey_stand_beside_those_of_this_one(
         _ = Material(later, over=(later,)).others
 
 
+@pytest.mark.slow
 def test_a_road_is_its_line_and_what_lies_beside_it(survey_file: Path, published: Published) -> None:
     material = Material(opened(survey_file))
     layer = next(one for one in read(published, "survey.json")["layers"] if one["name"] == "reference_lines")
@@ -523,6 +540,7 @@ def test_a_box_that_is_none_is_refused(text: str) -> None:
         box_from_text(text)
 
 
+@pytest.mark.slow
 def test_layers_open_in_other_programs(survey_file: Path, published: Published, tmp_path: Path) -> None:
     session, entry = opened(survey_file), read(published, "survey.json")
     assert len(entry["features"]) == len(entry["layers"]) > 3
@@ -549,6 +567,7 @@ def test_layers_open_in_other_programs(survey_file: Path, published: Published, 
     assert (tmp_path / "again.fgb").read_bytes() == (published.folder / "features/tiles.fgb").read_bytes()
 
 
+@pytest.mark.slow
 def test_the_catalogue_is_stac(survey_file: Path, published: Published) -> None:
     pystac = pytest.importorskip("pystac", reason="pystac is not installed")
     collection = pystac.Collection.from_file(str(published.folder / "catalog" / "collection.json"))
@@ -569,6 +588,7 @@ def test_the_catalogue_is_stac(survey_file: Path, published: Published) -> None:
     assert placed == pytest.approx([west, south, east, north], abs=0.01)
 
 
+@pytest.mark.slow
 def test_pictures_are_stac_items(survey_file: Path, published: Published) -> None:
     pystac = pytest.importorskip("pystac", reason="pystac is not installed")
     told = read(published, "survey.json")["picture_items"]
@@ -595,6 +615,7 @@ def test_pictures_are_stac_items(survey_file: Path, published: Published) -> Non
     collection.validate()
 
 
+@pytest.mark.slow
 def test_the_virtual_point_cloud_names_the_sheets(published: Published) -> None:
     virtual, index = read(published, "catalog/points.vpc"), read(published, "clouds/index.json")
     assert sum(f["properties"]["pc:count"] for f in virtual["features"]) == index["points"]
@@ -642,6 +663,7 @@ def with_page(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_single_file_holds_all(survey_file: Path, published: Published, with_page: Path, tmp_path: Path) -> None:
     made = write_single(Material(opened(survey_file)), tmp_path / "street.html")
     page = Scripts((tmp_path / "street.html").read_text())
@@ -662,6 +684,7 @@ def test_a_single_file_holds_all(survey_file: Path, published: Published, with_p
     }
 
 
+@pytest.mark.slow
 def test_a_single_file_has_a_limit(survey_file: Path, with_page: Path, tmp_path: Path) -> None:
     material = Material(opened(survey_file), Wishes(clouds=False))
     whole = write_single(material, tmp_path / "whole.html").bytes
@@ -673,6 +696,7 @@ def test_a_single_file_has_a_limit(survey_file: Path, with_page: Path, tmp_path:
     assert not (tmp_path / "none.html").exists()
 
 
+@pytest.mark.slow
 def test_without_the_page_the_data_are_published_and_it_is_said(
     survey_file: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -684,6 +708,7 @@ def test_without_the_page_the_data_are_published_and_it_is_said(
     assert isinstance(done.exception, ConfigError) and "make viewer" in str(done.exception)
 
 
+@pytest.mark.slow
 def test_hostile_names_are_data(survey_file: Path, with_page: Path, tmp_path: Path) -> None:
     nasty = "</script><script>alert(1)</script><!--<img src=x onerror=alert(2)>\u2028'\"&"
     copy = Simulated(survey_file).copy_with_store_to(tmp_path / "survey")
@@ -738,6 +763,7 @@ def test_what_json_has_no_word_for_is_null_and_long_numbers_are_text() -> None:
     assert told == {"a": None, "b": [None, 1.5], "c": str(2**60), "d": [0, 1], "e": None}
 
 
+@pytest.mark.slow
 def test_a_large_layer_is_cut_into_sheets(survey_file: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(vectors, "_MOST_VERTICES", 10)
     material = Material(opened(survey_file))
@@ -753,6 +779,7 @@ def test_a_large_layer_is_cut_into_sheets(survey_file: Path, monkeypatch: pytest
     assert [one["properties"] for one in features] == [{"state": "done"}] * layer["features"]
 
 
+@pytest.mark.slow
 def test_a_report_that_is_lost_is_told(survey_file: Path, tmp_path: Path) -> None:
     copy = tmp_path / "survey"
     shutil.copytree(survey_file.parent, copy)
@@ -765,6 +792,7 @@ def test_a_report_that_is_lost_is_told(survey_file: Path, tmp_path: Path) -> Non
     assert "report.html is missing: `roadscan report` writes it again" in told
 
 
+@pytest.mark.slow
 def test_the_inventory_is_shown_and_edited(survey_file: Path, tmp_path: Path) -> None:
     """What `roadscan view --edit` does: the page's edits are in the site at once, and the page's layers in metres."""
     copy = tmp_path / "survey"
@@ -835,6 +863,7 @@ def entry_of(material: Material) -> dict[str, Any]:
     return dict(Edits().members(material))
 
 
+@pytest.mark.slow
 def test_heights_of_a_table_are_metres_once(survey_file: Path, tmp_path: Path) -> None:
     """GeoParquet is in the CRS's own units: feet of a map in feet become metres, and no further."""
     copy = tmp_path / "survey"
@@ -850,6 +879,7 @@ def test_heights_of_a_table_are_metres_once(survey_file: Path, tmp_path: Path) -
     assert shapely.get_coordinates(held.shapes_m, include_z=True) == pytest.approx(np.array([[30.0, 60.0, 90.0]]))
 
 
+@pytest.mark.slow
 @drawn()
 def test_a_thumbnail_shows_the_map(survey_file: Path, tmp_path: Path) -> None:
     material = Material(opened(survey_file))
@@ -877,6 +907,7 @@ def test_a_thumbnail_shows_the_map(survey_file: Path, tmp_path: Path) -> None:
     assert same[finest[..., 1] > 0].mean() > 0.8  # the others lie under lines
 
 
+@pytest.mark.slow
 def test_a_survey_without_tiles_is_shown_where_its_layers_are(survey_file: Path) -> None:
     material = Material(opened(survey_file))
     material.__dict__["tiles"] = {}

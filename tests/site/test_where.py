@@ -52,6 +52,7 @@ def projected(folder: Path, place: np.ndarray) -> dict[str, tuple[float, float, 
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("above_m", [0.0, 1.5])
 def test_pictures_of_a_place_are_those_that_a_projection_gives(driven: Simulated, above_m: float) -> None:
     known = truth.load(driven.survey_file.parent)
@@ -72,6 +73,7 @@ def test_pictures_of_a_place_are_those_that_a_projection_gives(driven: Simulated
     assert told.exit_code == 0 and str(frame["file"][0]) in told.stdout.splitlines()[2]
 
 
+@pytest.mark.slow
 def test_a_place_beyond_the_survey_needs_a_height(driven: Simulated) -> None:
     with pytest.raises(ConfigError, match="no cell lies within 1 m"):
         rs.open_survey(driven.survey_file).pictures_of(0.0, 0.0)

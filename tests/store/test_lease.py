@@ -70,6 +70,7 @@ def test_a_second_run_is_refused_in_words_and_at_once(url: str) -> None:
         pass
 
 
+@pytest.mark.slow
 def test_of_runs_that_begin_at_once_one_has_the_store(url: str) -> None:
     inside: list[int] = []
     together: list[int] = []
@@ -98,6 +99,7 @@ def test_the_living_lease_of_a_container_with_this_name_and_number_is_not_taken(
         pass
 
 
+@pytest.mark.slow
 def test_the_dead_lease_of_a_container_is_taken_when_it_is_over(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A container with a fixed name, whose dead lock names the next run itself."""
     store = Store(url, "s1")
@@ -130,6 +132,7 @@ def test_a_killed_holder_of_this_machine_is_followed_at_once(url: str) -> None:
         pass
 
 
+@pytest.mark.slow
 def test_a_lease_is_renewed_while_it_is_held(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lease, "_RENEW_S", 0.3)
     monkeypatch.setattr(lease, "LEASE_S", 2.0)

@@ -120,6 +120,7 @@ def test_nulls_and_names_are_sorted_too() -> None:
     assert found.schema.equals(batch.schema)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("budget", [1, 20_000, 10**9])
 def test_a_log_is_stored_the_same_by_the_slow_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, budget: int) -> None:
     monkeypatch.setattr("roadscan.store.writer.BUDGET_BYTES", budget)

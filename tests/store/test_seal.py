@@ -20,6 +20,7 @@ def flipped(content: bytes, bit: int) -> bytes:
     return b"".join([content[: bit // 8], bytes([content[bit // 8] ^ 1 << bit % 8]), content[bit // 8 + 1 :]])
 
 
+@pytest.mark.slow
 def test_each_flipped_bit_is_refused_or_harmless(tmp_path) -> None:  # type: ignore[no-untyped-def]
     content, store = sealed_parquet(TABLE, compression="zstd"), Store(str(tmp_path), "s")
     assert store.parse_table(content, "x.parquet").equals(TABLE, check_metadata=True)

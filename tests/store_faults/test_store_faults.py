@@ -58,6 +58,7 @@ def read(street: Inventory) -> Any:
     )
 
 
+@pytest.mark.slow
 def test_no_fault_in_an_inventory_is_silent(tmp_path: Path) -> None:
     street = kept(tmp_path / "base")
     assert file_of(street).exists()
@@ -97,6 +98,7 @@ def test_the_last_commit_of_an_inventory_cannot_go_unseen(tmp_path: Path) -> Non
         street.truth.commits  # noqa: B018 — reading is what is asked
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
 def test_verify_names_a_fault_in_a_store(finished: Simulated, tmp_path: Path, fault: str) -> None:
     tree = Tree(finished.survey_file.parent, tmp_path / "work")

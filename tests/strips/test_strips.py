@@ -101,10 +101,12 @@ def anywhere(raw: UInt16) -> UInt16:
     return np.where(random.random(raw.shape) < 0.05, random.integers(1, 50_000, raw.shape), raw).astype(np.uint16)
 
 
+@pytest.mark.slow
 def test_heads_that_are_right_are_not_named(tmp_path: Path) -> None:
     assert told(tmp_path) == []
 
 
+@pytest.mark.slow
 @pytest.mark.witness("along_travel")
 @pytest.mark.parametrize("late_s", [LATE_S, -0.4])
 def test_a_late_head_is_named_at_one_speed_and_without_ticks(tmp_path: Path, late_s: float) -> None:
@@ -117,6 +119,7 @@ def test_a_late_head_is_named_at_one_speed_and_without_ticks(tmp_path: Path, lat
     assert sigma_m < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.witness("sees_road")
 def test_a_head_whose_axes_look_up_is_named(tmp_path: Path) -> None:
     (line,) = told(tmp_path, axes="flu")
@@ -124,6 +127,7 @@ def test_a_head_whose_axes_look_up_is_named(tmp_path: Path) -> None:
     assert "+2.00 m above the body's origin; the other sensors see it 2.00 m below" in line
 
 
+@pytest.mark.slow
 @pytest.mark.witness("readings_agree")
 def test_a_head_that_reads_anything_is_named_with_the_share(tmp_path: Path) -> None:
     (line,) = told(tmp_path, wrong=anywhere)

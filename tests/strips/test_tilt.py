@@ -88,6 +88,7 @@ def test_half_a_roll_is_named(tmp_path: Path) -> None:
     assert float(line.split("sways ")[1].split(" ")[0]) == pytest.approx(2.0, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("late_s", [LATE_S, -LATE_S])
 def test_a_late_roll_is_named_with_the_time(tmp_path: Path, late_s: float) -> None:
     (line,) = told(tmp_path, lambda at: roll_deg(at - late_s))

@@ -56,6 +56,7 @@ def at(found: object) -> tuple[np.ndarray, np.ndarray]:
     return found.x_steps / 2.0**36, found.y_steps / 2.0**36  # type: ignore[attr-defined]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["quadratic", "cubic"])
 def test_a_quadratic_comes_back_from_its_points_alone(kind: str) -> None:
     places = scattered(300, 0) * [1.0, 0.2] + [0.0, 0.4]  # spacing five times larger one way

@@ -156,6 +156,7 @@ def test_chains_and_peaks_like_loops():
         assert max(abs(i - 9), abs(j - 11)) > 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("way", "sensor", "crack"),
     [

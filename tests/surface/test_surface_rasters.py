@@ -76,6 +76,7 @@ def shaded(heights: np.ndarray, cell: tuple[float, float]) -> np.ndarray:
     return np.rint(1 + 254 * np.maximum(normal @ light, 0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("surface", "sheet_m", "cell"),
     [

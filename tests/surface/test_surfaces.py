@@ -200,6 +200,7 @@ def test_files_of_cells_without_lowest_readings_say_so(cells: Reconstructed) -> 
     assert surface_of(tile, patch, planned.grid).lowest is None
 
 
+@pytest.mark.slow
 def test_workers_and_blocks_change_no_byte(cells: Reconstructed, monkeypatch: pytest.MonkeyPatch) -> None:
     survey = cells.survey(CELLS)
     made, files = cells.run(survey)
@@ -238,6 +239,7 @@ def test_what_is_stale_is_made_again(cells: Reconstructed) -> None:
     assert cells.run(cells.survey(None, {"make": [], "options": {}})) == ([], {})
 
 
+@pytest.mark.slow
 def test_a_damaged_file_of_cells_costs_the_tiles_that_see_it(cells: Reconstructed) -> None:
     cells.forget()
     survey = cells.survey(CELLS, {"make": ["surface"], "options": {}})
@@ -261,6 +263,7 @@ def test_a_damaged_file_of_cells_costs_the_tiles_that_see_it(cells: Reconstructe
     assert set(cells.run(survey)[0]) == lost
 
 
+@pytest.mark.slow
 def test_surfaces_wait_for_cells_of_the_survey_as_it_is(cells: Reconstructed) -> None:
     survey = cells.survey(CELLS)
     _, files = cells.run(survey)
@@ -290,6 +293,7 @@ def test_smoothed_cells_are_nearer_to_the_truth(cells: Reconstructed) -> None:
     assert np.sqrt(np.mean(smooth**2)) < 0.75 * np.sqrt(np.mean(raw**2))
 
 
+@pytest.mark.slow
 def test_points_are_seamless_and_nearer_to_the_truth(points: Reconstructed) -> None:
     found = points.surfaces(**POINTS)
     assert_seamless(found)
@@ -315,6 +319,7 @@ def _errors(found: dict[TileId, SurfaceTile], truth: object) -> tuple[np.ndarray
     return raw[usual], smooth[usual]
 
 
+@pytest.mark.slow
 def test_blocks_of_points_change_no_bit(points: Reconstructed) -> None:
     singly = points.surfaces(**POINTS)
     pair = sorted(singly, key=lambda t: -np.count_nonzero(singly[t].origin))[:2]
@@ -324,6 +329,7 @@ def test_blocks_of_points_change_no_bit(points: Reconstructed) -> None:
             assert getattr(together[tile], name).tobytes() == getattr(singly[tile], name).tobytes()
 
 
+@pytest.mark.slow
 def test_polygons_bound_the_surface(points: Reconstructed, tmp_path: Path) -> None:
     whole = points.surfaces(**POINTS)
     tile, seen = max(whole.items(), key=lambda one: np.count_nonzero(one[1].origin[one[1].inner]))
@@ -348,6 +354,7 @@ UNSMOOTHED: dict[str, object] = {**POINTS, "smooth": False, "max_gap_m": 0.15}
 FOUND: dict[str, object] = {**UNSMOOTHED, "regions": "found"}
 
 
+@pytest.mark.slow
 def test_found_regions_bound_the_surface(points: Reconstructed, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("roadscan.surface.tasks.found_regions._LONGEST_S", 1)  # several pieces of the drive
     survey = points.survey(FOUND, {"make": ["surface"], "options": {}})
@@ -386,6 +393,7 @@ def test_found_regions_bound_the_surface(points: Reconstructed, monkeypatch: pyt
     assert not points.store.files("tables/regions")
 
 
+@pytest.mark.slow
 def test_workers_change_no_byte_of_a_pothole_on_the_border_of_tiles(points: Reconstructed, tmp_path: Path) -> None:
     scene = load(points.simulated.survey_file.parent).scene
     place, azimuth = scene.map, np.radians(scene.map.azimuth_deg)
@@ -426,6 +434,7 @@ def test_polygons_beside_the_survey_are_an_error(points: Reconstructed, tmp_path
         points.run(points.survey({**POINTS, "regions": "polygons", "polygons": str(tmp_path / "nothing.gpkg")}))
 
 
+@pytest.mark.slow
 def test_a_tile_without_a_reading_has_the_surface_that_reaches_into_it(points: Reconstructed) -> None:
     survey = points.survey(POINTS)
     planned = points.plan(survey)

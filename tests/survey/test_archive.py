@@ -41,6 +41,7 @@ def raw_of(folder: Path) -> dict[str, bytes]:
     return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("raw/**/*")) if p.is_file()}
 
 
+@pytest.mark.slow
 def test_logs_go_and_come_back(copy: Simulated, to: str) -> None:
     folder = copy.survey_file.parent
     raw = raw_of(folder)

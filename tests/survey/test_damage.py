@@ -53,6 +53,7 @@ def say(*command: str | Path) -> tuple[int, str]:
     return found.exit_code, found.output
 
 
+@pytest.mark.slow
 def test_damaged_records_are_told_in_one_go_and_mended(finished: Simulated, tmp_path: Path) -> None:
     copy = finished.copy_with_store_to(tmp_path / "survey")
     store, survey = copy.store(), Survey.load(copy.survey_file)
@@ -120,6 +121,7 @@ def spoil(store: Store, damage: str) -> list[str]:
     return spoilt
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("damage", sorted(DAMAGES))
 def test_damaged_files_are_found_and_made_again(made: tuple[Simulated, dict[str, bytes]], damage: str) -> None:
     copy, whole = made
@@ -155,6 +157,7 @@ def test_damaged_files_are_found_and_made_again(made: tuple[Simulated, dict[str,
     assert verify_store(store) == []
 
 
+@pytest.mark.slow
 def test_a_run_mends_what_it_stumbles_over(made: tuple[Simulated, dict[str, bytes]]) -> None:
     """Bits that flipped are not seen by a file's size: who reads them fails, and the next run makes them again."""
     copy, whole = made
@@ -177,6 +180,7 @@ def test_a_run_mends_what_it_stumbles_over(made: tuple[Simulated, dict[str, byte
     assert verify_store(store) == []
 
 
+@pytest.mark.slow
 def test_a_folder_in_place_of_a_file_is_set_aside(made: tuple[Simulated, dict[str, bytes]]) -> None:
     copy, whole = made
     store = copy.store()

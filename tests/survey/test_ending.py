@@ -115,6 +115,7 @@ main()
 """The command line, with Ctrl-C as soon as the LAZ library, in Rust, calls back to write."""
 
 
+@pytest.mark.slow
 def test_a_signal_that_a_library_makes_an_error_of_its_own_of_ends_a_run(tiny: Simulated, tmp_path: Path) -> None:
     copy = tiny.copy_to(tmp_path / "survey")
     copy.survey_file.write_text(copy.survey_file.read_text() + '\n[products]\nmake = ["las"]\n')
@@ -139,6 +140,7 @@ def test_a_folder_in_place_of_a_survey_file_is_one_line(tmp_path: Path) -> None:
     in_one_line(roadscan("run", tmp_path), str(tmp_path), "this is a folder")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not UNWRITABLE.is_dir(), reason="no folder is known that nobody may write to")
 def test_a_place_that_must_not_be_written_is_one_line(tiny: Simulated, tmp_path: Path) -> None:
     place = UNWRITABLE / "roadscan"

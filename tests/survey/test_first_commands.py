@@ -78,6 +78,7 @@ def completed(words: str, folder: Path, shell: str) -> set[str]:
     return {line.split("\t")[0] for line in done.stdout.splitlines()}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not PROGRAM.exists(), reason="roadscan is not installed as a program")
 def test_a_shell_completes_files_formats_and_scenes(tmp_path: Path) -> None:
     (tmp_path / "SURVEY.toml").touch()
@@ -86,6 +87,7 @@ def test_a_shell_completes_files_formats_and_scenes(tmp_path: Path) -> None:
     assert completed("roadscan simulate u", tmp_path, "bash") == {n for n in shipped_scenes() if n.startswith("u")}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not PROGRAM.exists(), reason="roadscan is not installed as a program")
 @pytest.mark.parametrize("shell", ["zsh", "fish"])
 def test_other_shells_are_told_the_same_in_their_own_form(tmp_path: Path, shell: str) -> None:

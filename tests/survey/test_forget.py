@@ -42,6 +42,7 @@ def names_in(drive: Drive, name: str) -> list[str]:
     return found
 
 
+@pytest.mark.slow
 def test_named_pictures_go_for_ever(drive: Drive, tmp_path: Path) -> None:
     survey, archive = str(drive.survey_file), str(tmp_path / "archive")
     assert cli("archive", survey, "--to", archive).exit_code == 0

@@ -108,6 +108,7 @@ WRITERS: dict[str, tuple[str, Callable[[Path], None]]] = {
 }
 
 
+@pytest.mark.slow
 def test_every_writer_says_what_is_full(disk: Path) -> None:
     store = Store(str(disk / "store"), "s")
     store.write_bytes("manifest/first", b"1")
@@ -121,6 +122,7 @@ def test_every_writer_says_what_is_full(disk: Path) -> None:
     assert store.files("manifest") == ["manifest/first"] and store.files(".staging") == []
 
 
+@pytest.mark.slow
 def test_a_run_on_a_full_disk_goes_on_when_there_is_room(finished: Simulated, disk: Path) -> None:
     products = {"products__make": ["las", "geotiff", "hillshade", "mosaic"]}
     survey = changed(Survey.load(finished.survey_file), products)

@@ -19,6 +19,7 @@ def answer(*words: str, code: int = 0) -> Any:
     return json.loads(done.stdout)
 
 
+@pytest.mark.slow
 def test_status_and_verify(finished: Simulated, tmp_path: Path) -> None:
     """Before and after a file of a tile is damaged; files are counted in the store's folder."""
     copy = finished.copy_with_store_to(tmp_path / "copy")

@@ -61,6 +61,7 @@ def rms(errors: Any) -> float:
     return float(np.sqrt(np.mean(errors**2)))
 
 
+@pytest.mark.slow
 def test_a_bag_becomes_a_road(tmp_path: Path) -> None:
     """A VLP-16 on a short straight street, which tells little of roll and pitch: σ say so."""
     scene = Scene.load("low_cost_rig").changed(

@@ -299,6 +299,7 @@ def test_an_older_list_of_logs_is_read(tmp_path: Path) -> None:
 # --- stamps and mountings ---------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.witness("one_stamp")
 def test_a_log_of_one_stamp_fails_beside_others(tmp_path: Path) -> None:
     log = '[[runs.logs]]\npath = "more.parquet"\nsensor = "profiler"\n\n'
@@ -475,6 +476,7 @@ def test_centre_lines_that_leave_nothing_fail(tmp_path: Path) -> None:
 # --- kinds and segmentation -------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_segmentation_says_to_what_it_applies(simulated: Simulated, tmp_path: Path) -> None:
     folder = simulated.copy_to(tmp_path / "survey").survey_file.parent
     text = (folder / "SURVEY.toml").read_text()

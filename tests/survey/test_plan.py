@@ -128,6 +128,7 @@ def test_after_a_changed_setting_it_says_what_the_run_then_does(copy: Simulated)
     assert after["products"]["current"] == 7  # the filter met no reading: unknown was the word for it
 
 
+@pytest.mark.slow
 def test_memory_of_a_worker_is_told_of_what_searches_returns(copy: Simulated) -> None:
     """It grows with the readings of a task: by 100 bytes each of a row group, by 430 each of a scene."""
     text = copy.survey_file.read_text()

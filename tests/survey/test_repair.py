@@ -64,6 +64,7 @@ def rows(store: Store, view: str, damaged: list[StoreError]) -> str:
     return str(query(store, f"SELECT count(*), bit_xor(hash(one)) FROM {view} AS one", damaged=damaged).to_pylist())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("view", sorted(OPENED))
 def test_no_flipped_byte_makes_a_silent_answer(whole: Simulated, view: str) -> None:
     store = whole.store()
@@ -88,6 +89,7 @@ def test_no_flipped_byte_makes_a_silent_answer(whole: Simulated, view: str) -> N
     assert rows(store, view, damaged) == right and damaged == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["log record", "manifest"])
 def test_no_flipped_byte_of_a_record_makes_a_silent_answer(whole: Simulated, kind: str) -> None:
     store = whole.store()
@@ -135,6 +137,7 @@ def test_a_table_whose_file_is_missing_is_not_called_unmade(finished: Simulated,
     assert code == 1 and "not shown: table 'control_points'" in words
 
 
+@pytest.mark.slow
 def test_whole_files_are_looked_at_and_not_read_again(whole: Simulated, monkeypatch: pytest.MonkeyPatch) -> None:
     """After a run, after `verify`, and after a query that read them."""
     store = whole.store()
@@ -162,6 +165,7 @@ def test_whole_files_are_looked_at_and_not_read_again(whole: Simulated, monkeypa
     assert held == [*first, first[0]]
 
 
+@pytest.mark.slow
 def test_a_run_notes_what_it_wrote(finished: Simulated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     copy = finished.copy_to(tmp_path / "survey")
     copy.run()
@@ -178,6 +182,7 @@ def damaged_tables(store: Store) -> list[Path]:
     return [largest(store, OPENED[view]) for view in ("returns", "scans", "trajectory")]
 
 
+@pytest.mark.slow
 def test_repair_reads_damaged_logs_again_and_nothing_is_stale(finished: Simulated, tmp_path: Path) -> None:
     copy = finished.copy_with_store_to(tmp_path / "survey")
     copy.run()
@@ -207,6 +212,7 @@ def stamp(store: Store, path: str) -> Stamp:
     return Stamp(found.st_ino, str(found.st_mtime_ns)) if found else Stamp(0, "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fate", ["gone", "changed"])
 def test_what_a_lost_log_costs_is_said_and_brought_back(finished: Simulated, tmp_path: Path, fate: str) -> None:
     copy = finished.copy_with_store_to(tmp_path / "survey")

@@ -48,6 +48,7 @@ def assert_same_files(a: Store, b: Store) -> None:
     assert [p for p in one if one[p] != other[p]] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("edge", "limit"), [(1, 20_000_000), (16, 100_000)])
 def test_block_size_changes_no_byte(finished: Simulated, edge: int, limit: int) -> None:
     name = f"store-{edge}-{limit}"
@@ -55,6 +56,7 @@ def test_block_size_changes_no_byte(finished: Simulated, edge: int, limit: int) 
     assert_same_files(finished.store(), finished.store(name))
 
 
+@pytest.mark.slow
 def test_shuffled_row_groups_change_no_byte(finished: Simulated, tmp_path: Path) -> None:
     copy = finished.copy_to(tmp_path / "survey")
     for file in copy.survey_file.parent.glob("raw/*/profiler_*.parquet"):
@@ -69,6 +71,7 @@ def test_shuffled_row_groups_change_no_byte(finished: Simulated, tmp_path: Path)
     assert_same_files(finished.store(), copy.store())
 
 
+@pytest.mark.slow
 def test_shuffled_row_groups_of_the_tables_change_no_byte(finished: Simulated, tmp_path: Path) -> None:
     """Ties included: a whole sweep of returns is put at one epoch before."""
     copy = finished.copy_to(tmp_path / "survey")
@@ -184,6 +187,7 @@ def test_selections(finished: Simulated) -> None:
     ).is_complete  # a refused choice is no failure
 
 
+@pytest.mark.slow
 def test_a_damaged_data_file_costs_its_tiles_only(finished: Simulated, tmp_path: Path) -> None:
     copy = finished.copy_with_store_to(tmp_path / "survey")
     store = copy.store()
@@ -273,6 +277,7 @@ def test_a_halo_adds_neighbours_and_changes_no_core_tile(finished: Simulated) ->
             assert np.array_equal(value, getattr(b[inner], name)), name
 
 
+@pytest.mark.slow
 def test_las_and_cells_agree(finished: Simulated) -> None:
     """The same points, counted and averaged once more by NumPy from the LAS file (written to 10 µm for this)."""
     finished.run("store-fine", products__make=["las"], products__options={"las": {"scale_m": 0.00001}})
@@ -292,6 +297,7 @@ def test_las_and_cells_agree(finished: Simulated) -> None:
     np.testing.assert_allclose(mean, cells.column("height_mean_m").to_numpy(), rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_run_keeps_a_second_one_out(finished: Simulated) -> None:
     command = [sys.executable, "-m", "roadscan", "run", str(finished.survey_file), "--workers", "0"]
     with finished.store().lock():
@@ -316,6 +322,7 @@ finally:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "more", "less"),
     [
@@ -365,6 +372,7 @@ def _lines(run: object) -> list[str]:
     return run.reporter.lines  # type: ignore[attr-defined]
 
 
+@pytest.mark.slow
 def test_one_missing_log_does_not_keep_the_others_out(finished: Simulated, tmp_path: Path) -> None:
     copy = finished.copy_to(tmp_path / "survey")
     lidar = copy.survey_file.parent / "raw/run-1/lidar.pcap"
@@ -388,6 +396,7 @@ def test_raw_logs_may_be_archived_once_they_are_ingested(finished: Simulated, tm
     assert survey_status(Session(Survey.load(copy.survey_file), copy.store())).failures == []
 
 
+@pytest.mark.slow
 def test_a_tile_that_could_not_be_made_again_counts_as_stale(
     finished: Simulated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -407,6 +416,7 @@ def test_a_tile_that_could_not_be_made_again_counts_as_stale(
     assert_same_files(finished.store(), store)
 
 
+@pytest.mark.slow
 def test_files_that_a_stopped_run_had_not_recorded_go_with_the_next(
     finished: Simulated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -430,6 +440,7 @@ def test_files_that_a_stopped_run_had_not_recorded_go_with_the_next(
     assert_same_files(finished.store(), store)
 
 
+@pytest.mark.slow
 def test_a_log_listed_twice_adds_nothing(finished: Simulated, tmp_path: Path) -> None:
     copy = finished.copy_to(tmp_path / "survey")
     raw = copy.survey_file.parent / "raw/run-1"
@@ -446,6 +457,7 @@ def test_a_log_listed_twice_adds_nothing(finished: Simulated, tmp_path: Path) ->
     assert_same_files(finished.store(), copy.store())
 
 
+@pytest.mark.slow
 def test_adding_a_run_leaves_the_tiles_of_others_alone(finished: Simulated, tmp_path: Path) -> None:
     copy = finished.copy_to(tmp_path / "survey")
     runs = Survey.load(copy.survey_file).config.model_dump(mode="json")["runs"]
@@ -468,6 +480,7 @@ def test_adding_a_run_leaves_the_tiles_of_others_alone(finished: Simulated, tmp_
     assert swapped.failures == []
 
 
+@pytest.mark.slow
 def test_a_tile_that_a_filter_empties_loses_its_files(finished: Simulated, tmp_path: Path) -> None:
     copy = finished.copy_with_store_to(tmp_path / "survey")
     record = max((r for r in Manifest(copy.store()).of("tile").values() if r.path), key=lambda r: r.figures()["points"])
@@ -487,6 +500,7 @@ def test_a_tile_that_a_filter_empties_loses_its_files(finished: Simulated, tmp_p
     assert_same_files(copy.store(), copy.store("store-b"))
 
 
+@pytest.mark.slow
 def test_a_damaged_or_missing_product_is_made_again(finished: Simulated, tmp_path: Path) -> None:
     copy = finished.copy_with_store_to(tmp_path / "survey")
     store, survey = copy.store(), Survey.load(copy.survey_file)
@@ -534,6 +548,7 @@ def test_a_statement_of_tables_that_a_run_made_opens_no_log(finished: Simulated)
     assert [row["view_name"] for row in listed] == [name for (name,) in views]
 
 
+@pytest.mark.slow
 def test_sql_shows_the_logs_of_the_survey_only(finished: Simulated, tmp_path: Path) -> None:
     copy = finished.copy_with_store_to(tmp_path / "survey")
     sbet = copy.survey_file.parent / "raw/run-1/trajectory.sbet"

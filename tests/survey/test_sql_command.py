@@ -44,6 +44,7 @@ def test_long_text_is_printed_whole(finished: Simulated) -> None:
     assert f"a{'b' * 400}c" in sql(finished, "SELECT 'a' || repeat('b', 400) || 'c' AS text")
 
 
+@pytest.mark.slow
 def test_utc_is_exact_at_leap_seconds(finished: Simulated) -> None:
     for day, leap in LEAP_SECONDS.items():
         midnight = dt.datetime.fromisoformat(f"{day}T00:00:00+00:00")

@@ -265,6 +265,7 @@ def test_the_command_takes_time_and_memory(finished: Simulated) -> None:
     assert (code, "the answer is larger than 0.1 GB" in text) == (2, True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unconfined", [False, True])
 def test_a_statement_takes_no_more_memory_than_it_is_given(finished: Simulated, unconfined: bool) -> None:
     """Groups of 0.5 GB, with 50 MB of memory and, where it may write, 200 MB of disk."""
@@ -282,6 +283,7 @@ def test_an_answer_has_a_bound_of_its_own(finished: Simulated) -> None:
     assert answer.column(0).to_pylist()[-1] == 999_999
 
 
+@pytest.mark.slow
 def test_what_is_spilt_is_bounded_and_removed(
     finished: Simulated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

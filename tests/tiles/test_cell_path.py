@@ -54,6 +54,7 @@ def test_fates_are_those_of_points(finished: Simulated, counted: Store) -> None:
     assert survey_status(Session(survey, counted)).readings == by_points
 
 
+@pytest.mark.slow
 def test_neither_blocks_nor_workers_change_a_byte(finished: Simulated, counted: Store) -> None:
     finished.run("store-counted-1", products__make=WITHOUT_POINTS, tiles__block_tiles=1)
     assert outputs(finished.store("store-counted-1")) == outputs(counted)
@@ -103,6 +104,7 @@ def test_a_damaged_row_group_costs_the_tiles_that_it_touches(finished: Simulated
     assert path.name in str(error.value)
 
 
+@pytest.mark.slow
 def test_a_turning_mirror(tmp_path: Path) -> None:
     scene = small_scene(sick={"on": True}, profilers={"on": False}, lidar={"on": False})
     survey = Simulated(simulate(scene, tmp_path).survey_file)

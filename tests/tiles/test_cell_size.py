@@ -83,6 +83,7 @@ def median_readings(stamps: np.ndarray, xyz: np.ndarray, speed: float, edge: flo
     return float(np.median(np.unique(np.floor(road / edge), axis=0, return_counts=True)[1]))
 
 
+@pytest.mark.slow
 def test_init_proposes_a_size_whose_cells_hold_enough_returns_of_a_lidar(tmp_path: Path) -> None:
     speed, (stamps, xyz) = 10.0, vlp16(12.0, 10.0)
     begun = stamps < 1.0

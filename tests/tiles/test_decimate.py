@@ -93,6 +93,7 @@ def by_numpy(cells, side, patch):
     return [np.array(c) for c in zip(*out, strict=True)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("side", "cell_m"), [(4, CELL_M), (20, CELL_M), (8, CELL_M), (40, CELL_M), (2, 0.05), (1, 0.05)]
 )

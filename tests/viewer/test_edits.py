@@ -80,6 +80,7 @@ def draw(page: Any, title: str, corners: list[tuple[float, float]], **fields: st
     page.locator(".edit-list li").nth(held).wait_for()
 
 
+@pytest.mark.slow
 def test_edits_go_into_the_inventory(opened: Opened) -> None:
     page, site = opened.page, opened.site
     assert opened.server.token not in page.url  # a link that is passed on allows nobody to edit
@@ -109,6 +110,7 @@ def test_edits_go_into_the_inventory(opened: Opened) -> None:
     assert serious(page) == []
 
 
+@pytest.mark.slow
 def test_a_new_pole_is_drawn_and_another_is_moved(opened: Opened) -> None:
     page, site = opened.page, opened.site
     go_to(page, f"at={EAST_M + 15.0},{NORTH_M + 1.0}&zoom=2&views=map")
@@ -137,6 +139,7 @@ def test_a_new_pole_is_drawn_and_another_is_moved(opened: Opened) -> None:
     assert 0.12 in state.assets["pole"].rows["diameter_m"].to_pylist()
 
 
+@pytest.mark.slow
 def test_a_crack_is_corrected_and_reshaped_and_a_pothole_is_drawn(opened: Opened) -> None:
     page, site = opened.page, opened.site
     (crack,) = site.inventory.state().assets["crack"].ids
@@ -209,6 +212,7 @@ def test_kinds_that_are_not_there_yet_are_drawn_with_their_forms(opened: Opened,
         page.locator(".layer-head label", has_text=schema.title).first.wait_for()
 
 
+@pytest.mark.slow
 def test_what_is_drawn_beside_the_surface_asks_for_its_height(opened: Opened) -> None:
     page, site = opened.page, opened.site
     go_to(page, f"at={EAST_M + 15.0},{NORTH_M + 30.0}&zoom=6&views=map")
@@ -225,6 +229,7 @@ def test_what_is_drawn_beside_the_surface_asks_for_its_height(opened: Opened) ->
     assert (shape.x, shape.y, shape.z) == pytest.approx((EAST_M + 15.0, NORTH_M + 30.0, 41.25), abs=1e-5)
 
 
+@pytest.mark.slow
 def test_a_pole_is_moved_by_keys(opened: Opened) -> None:
     page, site = opened.page, opened.site
     choose(opened, 1)
@@ -238,6 +243,7 @@ def test_a_pole_is_moved_by_keys(opened: Opened) -> None:
     assert (shape.x, shape.y, shape.z) == pytest.approx((EAST_M + 15.0, NORTH_M + 1.0, 40.0), abs=1e-5)
 
 
+@pytest.mark.slow
 def test_an_address_without_the_token_is_read_only(open_page: Any, opened: Opened) -> None:
     origin = opened.server.address.partition("#")[0]
     with open_page(origin) as other:

@@ -91,6 +91,7 @@ def message(page: Any, text: str) -> str:
     return str(page.locator(".toast").inner_text()).replace("\u202f", "")
 
 
+@pytest.mark.slow
 def test_every_control_point_is_drawn_in_the_colour_of_its_residual(page: Any) -> None:
     across_m = 8.0
     go_to(page, f"at={EAST_M + 19.0},{NORTH_M - 2.0}&zoom={across_m}&views=map")
@@ -111,6 +112,7 @@ def test_every_control_point_is_drawn_in_the_colour_of_its_residual(page: Any) -
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_link_names_a_lane_as_all_products_do(page: Any) -> None:
     lane = page.locator('.strips-head [aria-label="Lane"]')
     go_to(page, "lane=2&station=11&views=map,strips")
@@ -125,6 +127,7 @@ def test_a_link_names_a_lane_as_all_products_do(page: Any) -> None:
     assert "taken for the number 0 of an older link, lane 1 of road1" in message(page, "No lane is called 0")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["{lat:.7f},{lon:.7f}", "{lon:.7f} {lat:.7f}", "{lat:.7f}° N, {lon:.7f}° E"])
 def test_degrees_are_a_place_and_the_page_says_what_it_took_them_for(page: Any, form: str) -> None:
     east, north = EAST_M + 31.0, NORTH_M - 1.0
@@ -157,6 +160,7 @@ def test_places_in_degrees_are_those_of_proj_over_a_network() -> None:
     assert degrees_on_map(MapFrame(crs=None), box) is None
 
 
+@pytest.mark.slow
 def test_a_name_an_id_and_a_kind_are_found(page: Any) -> None:
     search(page, "transverse")
     page.locator(".details .over", has_text="Cracks").wait_for()
@@ -174,6 +178,7 @@ def test_a_name_an_id_and_a_kind_are_found(page: Any) -> None:
     assert page.evaluate("window.hit") is None
 
 
+@pytest.mark.slow
 def test_a_section_says_what_is_drawn_in_which_colour(open_page: Any, found_address: str) -> None:
     with open_page(found_address) as watched:
         page = watched.open_cloud(found_address)
@@ -187,6 +192,7 @@ def test_a_section_says_what_is_drawn_in_which_colour(open_page: Any, found_addr
         assert page.locator(".section-legend .key").count() == 3
 
 
+@pytest.mark.slow
 def test_the_dock_takes_no_more_room_than_it_fills(open_page: Any, found_address: str) -> None:
     with open_page(found_address) as watched:
         page = watched.open(f"{found_address}#views=map,strips")
@@ -197,6 +203,7 @@ def test_the_dock_takes_no_more_room_than_it_fills(open_page: Any, found_address
         assert page.locator(".dock").bounding_box()["height"] < 120
 
 
+@pytest.mark.slow
 def test_the_scale_of_heights_is_that_of_the_ground(open_page: Any, found_address: str) -> None:
     with open_page(found_address) as watched:
         page = watched.open_cloud(found_address)
@@ -215,6 +222,7 @@ def edits_of(page: Any) -> list[dict[str, Any]]:
     return [one["properties"] for one in features]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", ["Correct", "Confirm"])
 def test_confirming_and_correcting_an_asset_loses_neither(page: Any, first: str) -> None:
     go_to(page, "row=asset_poles/1&views=map")
@@ -235,6 +243,7 @@ def test_confirming_and_correcting_an_asset_loses_neither(page: Any, first: str)
     page.locator("dl.values", has_text=re.compile(r"4\.5.*, edited; it was \d")).wait_for()
 
 
+@pytest.mark.slow
 def test_edits_that_were_not_sent_are_there_again(page: Any) -> None:
     go_to(page, "row=asset_poles/1&views=map")
     page.locator(".edit button", has_text="Confirm").click()
@@ -252,6 +261,7 @@ def test_edits_that_were_not_sent_are_there_again(page: Any) -> None:
     assert page.locator(".edit-list li").count() == 0
 
 
+@pytest.mark.slow
 def test_drafts_are_sent_on_the_commit_that_they_were_made_on(opened: Opened) -> None:
     page, site = opened.page, opened.site
     correct(opened, 0, Condition="4")
@@ -262,6 +272,7 @@ def test_drafts_are_sent_on_the_commit_that_they_were_made_on(opened: Opened) ->
     assert site.inventory.state().row(site.id_of(0))["condition"] == 9
 
 
+@pytest.mark.slow
 def test_an_unlikely_place_is_asked_about_and_sent_once_it_is_right(opened: Opened) -> None:
     page, site = opened.page, opened.site
     one = site.id_of(0)

@@ -45,6 +45,7 @@ def network_address(network: Network) -> Iterator[str]:
     yield from served(network)
 
 
+@pytest.mark.slow
 def test_a_network_opens_as_a_street_does(open_page: Any, network: Network, network_address: str) -> None:
     with open_page(network_address) as watched:
         fetched = [0.0]
@@ -102,6 +103,7 @@ def strings_address(street: Path, tmp_path: Path) -> Iterator[str]:
     yield from served(FolderSite(site))
 
 
+@pytest.mark.slow
 def test_ten_thousand_strings_are_shown_as_text(open_page: Any, strings_address: str) -> None:
     with open_page(strings_address) as watched:
         page = watched.open(strings_address)

@@ -141,6 +141,7 @@ def click(yard: Yard, page: Any, point: str, picture: str) -> None:
     page.wait_for_selector(f'.control-tile[data-picture="run-1/camera/{picture}"][data-state="measured"]')
 
 
+@pytest.mark.slow
 def test_control_is_clicked_written_and_adjusted(yard: Yard, open_page: Any) -> None:
     with open_page(origin(yard)) as watched:
         page = open_control(yard, watched, "P1")
@@ -179,6 +180,7 @@ def test_control_is_clicked_written_and_adjusted(yard: Yard, open_page: Any) -> 
         assert page.locator(".control-missing").count() == 0
 
 
+@pytest.mark.slow
 def test_windows_do_not_overwrite_each_other_and_no_click_is_lost(yard: Yard, open_page: Any) -> None:
     with open_page(origin(yard)) as one, open_page(origin(yard)) as other:
         first, second = open_control(yard, one, "P2"), open_control(yard, other, "P2")
@@ -240,6 +242,7 @@ def open_picture(page: Any, picture: str) -> None:
         page.locator(f".picture-caption:has-text('{next_one:06d}.jpg')").wait_for()
 
 
+@pytest.mark.slow
 def test_a_line_in_a_picture_is_a_line_on_the_map(yard: Yard, open_page: Any) -> None:
     survey = rs.open_survey(yard.made.survey_file)
     with open_page(origin(yard)) as watched:
@@ -268,6 +271,7 @@ def test_a_line_in_a_picture_is_a_line_on_the_map(yard: Yard, open_page: Any) ->
     assert f"{feature['properties']['length_m']:.3f}" in text and "3 of 3" in text
 
 
+@pytest.mark.slow
 def test_two_pictures_give_a_place_and_the_second_shows_the_ray_of_the_first(yard: Yard, open_page: Any) -> None:
     names = ("000000.jpg", "000002.jpg")
     true = [yard.truth("P4", name) for name in names]
@@ -301,6 +305,7 @@ def test_two_pictures_give_a_place_and_the_second_shows_the_ray_of_the_first(yar
     assert "rays meet at" in expected["warning"] and "rays meet at" in text  # of 4 m between two pictures ahead
 
 
+@pytest.mark.slow
 def test_a_published_site_offers_none_of_it(yard: Yard, watched: Any, address: str) -> None:
     assert Measuring().members(Material(Session.open(yard.made.survey_file), Wishes())) == {"measuring": None}
     page = watched.open(f"{address}#views=map,pictures")

@@ -54,6 +54,7 @@ def _middle(page: Any, dx: float = 0, dy: float = 0) -> None:
     page.mouse.click(box["x"] + box["width"] / 2 + dx, box["y"] + box["height"] / 2 + dy)
 
 
+@pytest.mark.slow
 def test_the_page_opens_with_all_its_views(watched: Any, address: str) -> None:
     page = watched.open_cloud(address)
     assert page.title().endswith("roadscan")
@@ -62,6 +63,7 @@ def test_the_page_opens_with_all_its_views(watched: Any, address: str) -> None:
     page.locator(".strips .panel canvas").first.wait_for()
 
 
+@pytest.mark.slow
 def test_a_click_on_a_target_reads_its_coordinates(watched: Any, address: str) -> None:
     page = watched.open_cloud(address)
     _look(page, TARGET, across_m=3)
@@ -69,6 +71,7 @@ def test_a_click_on_a_target_reads_its_coordinates(watched: Any, address: str) -
     assert np.abs(_read(page) - TARGET).max() <= 0.005
 
 
+@pytest.mark.slow
 def test_a_click_on_the_map_reads_place_and_height(watched: Any, address: str) -> None:
     page = watched.open(f"{address}#views=map")
     page.locator("#search").fill(f"{EAST_M + 10.5} {NORTH_M + 2.5}")
@@ -87,6 +90,7 @@ def test_a_click_on_the_map_reads_place_and_height(watched: Any, address: str) -
     assert abs(height - height_m(east, north)) <= 0.001
 
 
+@pytest.mark.slow
 def test_distances_in_the_cloud_are_those_of_its_points(watched: Any, address: str) -> None:
     page = watched.open_cloud(address)
     page.locator('.cloud-view ~ .toolbar [aria-label="Height difference"]').click()
@@ -102,6 +106,7 @@ def test_distances_in_the_cloud_are_those_of_its_points(watched: Any, address: s
     assert abs(rise) <= 0.022 * level + 0.02
 
 
+@pytest.mark.slow
 def test_the_cross_section_of_the_cloud_agrees_with_the_table(watched: Any, address: str) -> None:
     page = watched.open_cloud(address)
     go_to(page, "lane=0&station=20.02")
@@ -110,6 +115,7 @@ def test_the_cross_section_of_the_cloud_agrees_with_the_table(watched: Any, addr
     assert float(page.locator(".section-panel").get_attribute("data-rms")) <= 1.0
 
 
+@pytest.mark.slow
 def test_a_profile_along_a_line_agrees_with_the_street(watched: Any, address: str) -> None:
     page = watched.open_cloud(address)
     page.locator('.cloud-view ~ .toolbar [aria-label="Profile along a line"]').click()
@@ -133,6 +139,7 @@ def test_a_profile_along_a_line_agrees_with_the_street(watched: Any, address: st
     assert np.median(sigma) <= 0.001
 
 
+@pytest.mark.slow
 def test_a_row_shows_its_sigma_and_evidence_as_text(watched: Any, address: str) -> None:
     page = watched.open_cloud(f"{address}#row=asset_poles/1")
     details = page.locator(".details")
@@ -152,6 +159,7 @@ def test_a_row_shows_its_sigma_and_evidence_as_text(watched: Any, address: str) 
     assert page.locator("img").count() == 0
 
 
+@pytest.mark.slow
 def test_evidence_leads_to_what_it_names(watched: Any, address: str) -> None:
     page = watched.open_cloud(f"{address}#row=cracks/7")
     evidence = page.locator(".evidence")
@@ -189,6 +197,7 @@ def _in_the_ball(place: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     return np.array([u, (np.arcsin(down / np.linalg.norm(by)) / np.pi + 0.5) * 512 - 0.5])
 
 
+@pytest.mark.slow
 def test_a_picture_marks_the_place_and_a_pixel_finds_it(watched: Any, address: str) -> None:
     page = watched.open_cloud(address)
     _look(page, TARGET, across_m=3)
@@ -210,6 +219,7 @@ def test_a_picture_marks_the_place_and_a_pixel_finds_it(watched: Any, address: s
     assert np.abs(_read(page) - TARGET).max() <= 0.005
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("north", "hidden"), [(3.5, True), (-3.0, False)], ids=["behind the pole", "on the road"])
 def test_a_picture_tells_whether_something_hides_the_place(
     watched: Any, address: str, north: float, hidden: bool
@@ -226,6 +236,7 @@ def test_a_picture_tells_whether_something_hides_the_place(
     assert ("behind something" in flat.inner_text()) == hidden
 
 
+@pytest.mark.slow
 def test_a_panorama_marks_the_place(watched: Any, address: str) -> None:
     page = watched.open_cloud(address)
     page.locator("#search").fill(f"{TARGET[0]} {TARGET[1]} {TARGET[2]}")
@@ -237,6 +248,7 @@ def test_a_panorama_marks_the_place(watched: Any, address: str) -> None:
     assert np.abs(mark - _in_the_ball(np.array(TARGET))).max() <= 0.02
 
 
+@pytest.mark.slow
 def test_the_surface_is_shown_as_a_mesh(watched: Any, address: str) -> None:
     page = watched.open_cloud(address)
     _look(page, (EAST_M + 20, NORTH_M, 40.0), across_m=6)
@@ -251,6 +263,7 @@ def test_the_surface_is_shown_as_a_mesh(watched: Any, address: str) -> None:
     assert red[1] > red[0] + 5_000
 
 
+@pytest.mark.slow
 def test_edits_become_a_document(watched: Any, address: str) -> None:
     page = watched.open(f"{address}#row=asset_poles/1&views=map")
     page.locator(".edit button", has_text="Correct").click()
@@ -271,6 +284,7 @@ def test_edits_become_a_document(watched: Any, address: str) -> None:
     assert EditDocument.parse(document).features[0].properties.asset_id == "1"
 
 
+@pytest.mark.slow
 def test_the_page_goes_on_without_the_host(watched: Any, address: str) -> None:
     page = watched.open_cloud(address)
     _look(page, (EAST_M + 20, NORTH_M, 40.0), across_m=4)
@@ -284,6 +298,7 @@ def test_the_page_goes_on_without_the_host(watched: Any, address: str) -> None:
     page.locator(".details h2", has_text="<script>").wait_for()
 
 
+@pytest.mark.slow
 def test_one_file_opens_by_itself(open_page: Any, single: Path) -> None:
     with open_page(single.as_uri(), offline=True) as watched:
         page = watched.open_cloud(single.as_uri())
@@ -295,6 +310,7 @@ def test_one_file_opens_by_itself(open_page: Any, single: Path) -> None:
         page.locator(".picture-caption", has_text="run_a").wait_for()
 
 
+@pytest.mark.slow
 def test_axe_finds_nothingserious(watched: Any, address: str) -> None:
     page = watched.open(f"{address}#row=asset_poles/1&views=map,cloud,strips")
     page.locator(".details h2").wait_for()
@@ -305,6 +321,7 @@ def test_axe_finds_nothingserious(watched: Any, address: str) -> None:
     assert serious(page) == []
 
 
+@pytest.mark.slow
 def test_a_phone_shows_one_view_at_a_time(open_page: Any, address: str) -> None:
     with open_page(viewport={"width": 390, "height": 800}) as watched:
         page = watched.open(address)
@@ -317,6 +334,7 @@ def test_a_phone_shows_one_view_at_a_time(open_page: Any, address: str) -> None:
         assert serious(page) == []
 
 
+@pytest.mark.slow
 def test_the_keyboard_reaches_a_row(watched: Any, address: str) -> None:
     page = watched.open(f"{address}#at={CURB[0]},{CURB[1]}&zoom=2&views=map")
     page.wait_for_selector(STILL)
@@ -329,6 +347,7 @@ def test_the_keyboard_reaches_a_row(watched: Any, address: str) -> None:
     assert page.locator("dialog.help").is_visible()
 
 
+@pytest.mark.slow
 def test_the_focus_stays_where_keys_are_used(watched: Any, address: str) -> None:
     page = watched.open_cloud(address)
     focused = "document.activeElement.ariaLabel ?? document.activeElement.textContent"
@@ -342,6 +361,7 @@ def test_the_focus_stays_where_keys_are_used(watched: Any, address: str) -> None
         assert page.evaluate(focused) == name
 
 
+@pytest.mark.slow
 def test_the_keyboard_measures_on_the_map_and_zooms_the_strips(watched: Any, address: str) -> None:
     page = watched.open(f"{address}#at={EAST_M + 10},{NORTH_M}&zoom=8&views=map,strips")
     page.wait_for_selector(STILL)
@@ -396,6 +416,7 @@ _UNREACHED = """(place) => {
 }"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("window", [(1440, 900), (1280, 1024), (1024, 768)])
 def test_at_200_percent_nothing_is_cut_off_or_out_of_reach(
     open_page: Any, address: str, window: tuple[int, int]

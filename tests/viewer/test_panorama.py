@@ -86,6 +86,7 @@ def driven(tmp_path_factory: pytest.TempPathFactory, browser: Any) -> Iterator[D
         yield Driven(made.survey_file.parent, server.address)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [0, 1])
 def test_place_and_pixel_of_a_panorama_find_one_another(driven: Driven, open_page: Any, number: int) -> None:
     target = driven.target(number)
@@ -113,6 +114,7 @@ def test_place_and_pixel_of_a_panorama_find_one_another(driven: Driven, open_pag
         assert np.linalg.norm(again - target) <= 0.05
 
 
+@pytest.mark.slow
 def test_pictures_of_a_place_are_named_with_its_pixel(driven: Driven) -> None:
     target = driven.target(1)
     found = rs.open_survey(driven.folder / "SURVEY.toml").pictures_of(*target)

@@ -89,6 +89,7 @@ def long_address(street: Path, tmp_path: Path) -> Iterator[str]:
     yield from served(FolderSite(site))
 
 
+@pytest.mark.slow
 def test_a_long_lane_is_fetched_in_full_where_people_look(open_page: Any, long_address: str) -> None:
     with open_page(long_address) as watched:
         asked: list[str] = []

@@ -105,6 +105,7 @@ def island(width_m: float, height_m: float) -> Scene:
     )
 
 
+@pytest.mark.slow
 def test_a_median_has_width_and_height() -> None:
     scene, kind = island(2.4, 0.15), Median()
     found = list(kind.objects(kind.evidence(scene, MedianOptions()).pieces, MedianOptions(), {}))

@@ -36,6 +36,7 @@ def lines_of(kerbs: list[AssetObject]) -> list[shapely.Geometry]:
     return [k.geometry for k in kerbs]
 
 
+@pytest.mark.slow
 def test_kerbs_of_a_labelled_street() -> None:
     """SemanticKITTI 00. Labels tell road from sidewalk; where the road meets terrain there are kerbs as well."""
     returns, labels, drive = semantic_kitti_returns()
@@ -96,6 +97,7 @@ def truth_line(street: SimulatedStreet, side: float, offset_m: float, station_m:
     return np.column_stack([e, n]) - street.corner_m[:2]
 
 
+@pytest.mark.slow
 def test_kerbs_of_a_simulated_street(street: SimulatedStreet, town: Scene) -> None:
     """HDL-32E, both directions, parked cars on the right: 5 cm and 8 mm."""
     kerbs = kerbs_of(town)
@@ -114,6 +116,7 @@ def test_kerbs_of_a_simulated_street(street: SimulatedStreet, town: Scene) -> No
     assert heights["dropped"][0] == pytest.approx(0.02, abs=0.012)
 
 
+@pytest.mark.slow
 def test_lines_are_cut_at_tiles_and_joined_to_the_same(town: Scene) -> None:
     """Four tiles with halos of 8 m: their joined kerbs are those of the whole."""
     whole, kind = kerbs_of(town), Kerb()
@@ -150,6 +153,7 @@ def test_nodes_of_a_line_are_the_same_wherever_a_square_lets_it_begin() -> None:
     np.testing.assert_allclose(np.hypot(*np.diff(whole, axis=0).T), 0.5, atol=0.05)
 
 
+@pytest.mark.slow
 def test_returns_on_the_face_are_marked(town: Scene) -> None:
     marked = Kerb().evidence(town, KerbOptions()).marked
     assert [m.code for m in marked] == [classes.KERB]
@@ -157,6 +161,7 @@ def test_returns_on_the_face_are_marked(town: Scene) -> None:
     assert np.abs(town.above_ground_m[marked[0].rows]).max() < 0.45
 
 
+@pytest.mark.slow
 def test_cells_alone_are_enough(street: SimulatedStreet) -> None:
     """Only a mean height a cell of 0.1 m, with 5 mm of noise."""
     x, y = truth_line(street, 1.0, 0.0, np.array([2.0, 26.0])).T

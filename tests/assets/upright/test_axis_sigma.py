@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from roadscan.assets.upright.shafts import sigma_of
 from roadscan.assets.upright.standing import uprights_of
 from tests.assets.upright.scene import simulated
 
 
+@pytest.mark.slow
 def test_sigma_is_as_large_as_the_errors() -> None:
     """Poles, lamp posts and trunks of the short street: RMS of error over σ of places and radii."""
     scene, table = simulated()

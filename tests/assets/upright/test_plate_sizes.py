@@ -26,6 +26,7 @@ TALL = {"triangle": math.sqrt(3.0) / 2.0}
 SWEEP_NS = 100_000_000  # The lidar turns ten times a second.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stamps", ["firings", "sweeps"])
 def test_sizes_of_signs_of_all_shapes_at_eighty_km_h(stamps: str) -> None:
     signs = [

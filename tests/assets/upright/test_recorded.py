@@ -28,6 +28,7 @@ def tall() -> list[Upright]:
     return [u for u in uprights_of(scene) if u.kind != "delineator"]
 
 
+@pytest.mark.slow
 def test_poles_and_trunks_are_found_where_they_stand() -> None:
     """The surface that returns of a shaft show lies π/4 of its radius before its axis, on the mean."""
     scene, _ = semantic_kitti_scene()
@@ -50,6 +51,7 @@ def test_poles_and_trunks_are_found_where_they_stand() -> None:
     assert np.quantile(errors, 0.95) <= 0.12
 
 
+@pytest.mark.slow
 def test_hardly_anything_else_is_taken_for_a_pole_or_a_trunk() -> None:
     """A shaft is right that shows a labelled pole or trunk; what was not judged by those who labelled is left out."""
     _, labels = semantic_kitti_scene()
@@ -77,6 +79,7 @@ def test_poles_and_trunks_of_products_of_sweeps_that_no_judge_was_fitted_to(tmp_
     assert share_of_class(street, TRUNK, classes.VEHICLE) <= 0.02
 
 
+@pytest.mark.slow
 def test_the_two_strong_signs_are_found_and_what_is_no_sign_is_not() -> None:
     scene, labels = semantic_kitti_scene()
     plates = [p for p in plates_of(scene, SignOptions()) if p.probability >= 0.5]

@@ -45,6 +45,7 @@ def joined(kind: str, scenes: list[Scene] | None = None) -> list[AssetObject]:
     return list(one.objects(pieces, one.options(), {}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["pole", "lighting", "tree", "delineator", "sign", "clearance"])
 def test_points_are_found_once_at_the_same_place(kind: str) -> None:
     scene, _ = simulated()

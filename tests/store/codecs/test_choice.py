@@ -52,6 +52,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["lists", "numbers", "cells"])
 def test_tables_hold_the_same(folders: dict[str, Path], name: str) -> None:
     own, library = (folders[choice] / f"{name}.parquet" for choice in ("own", "library"))
@@ -66,6 +67,7 @@ def test_tables_hold_the_same(folders: dict[str, Path], name: str) -> None:
         assert np.array_equal(steps, np.rint(steps)) and len(np.unique(steps)) > 100
 
 
+@pytest.mark.slow
 def test_streams_hold_the_same(folders: dict[str, Path]) -> None:
     own, library = ((folders[choice] / "stream").read_bytes() for choice in ("own", "library"))
     assert own != library and zlib.decompress(own) == zlib.decompress(library)

@@ -29,6 +29,7 @@ def tile_on(place, workshop, count=4_000):
     return Tile(None, full.cells), context
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compress", [True, False])
 def test_laspy_finds_a_point_at_the_centre_of_each_square(model, workshop, place, tmp_path, compress):
     tile, context = tile_on(place, workshop, count=900)

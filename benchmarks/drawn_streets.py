@@ -135,6 +135,47 @@ def street_of_covers(seed: int) -> Scene:
     return street.changed(id=f"covers-{seed}", roadside=held, lidar=lidar, bag={"on": True})
 
 
+def street_of_lookalikes(seed: int) -> Scene:
+    """A street of covers and wires with what is like them: stains, potholes, arms of signals and lamps, bridges."""
+    random = np.random.default_rng([seed, 47])
+    street = street_of_covers(seed)
+    paved = street.road.paved_m
+
+    def between(low: float, high: float) -> float:
+        return float(random.uniform(low, high))
+
+    def somewhere() -> dict[str, float]:
+        return {"station_m": between(0.0, LENGTH_M), "offset_m": between(-paved + 0.4, paved - 0.4)}
+
+    stains = [
+        somewhere() | {"length_m": between(0.3, 1.2), "width_m": between(0.25, 0.8), "shade": between(12.0, 45.0)}
+        for _ in range(8)
+    ]
+    potholes = [somewhere() | {"radius_m": between(0.15, 0.5), "depth_m": between(0.015, 0.08)} for _ in range(5)]
+    signals, lamps = [], []
+    for station in np.arange(4.0, LENGTH_M, 9.0):
+        side = float(random.choice([-1.0, 1.0]))
+        signals.append(
+            {
+                "station_m": station,
+                "offset_m": side * (paved + between(0.4, 1.2)),
+                "height_m": between(4.8, 7.0),
+                "arm_m": between(1.5, 6.0),
+                "diameter_m": between(0.1, 0.2),
+            }
+        )
+        lamps.append({"station_m": station + 4.5, "offset_m": -side * (paved + between(0.4, 1.5)),
+                      "height_m": between(4.5, 9.0), "arm_m": between(0.8, 3.0), "diameter_m": between(0.08, 0.2),
+                      "is_double": bool(random.random() < 0.5)})  # fmt: skip
+    bridge = {"station_m": between(8.0, LENGTH_M - 8.0), "offset_m": 0.0, "length_m": between(1.5, 4.0),
+              "width_m": 2.0 * paved + 4.0, "clearance_m": between(4.5, 6.0),
+              "thickness_m": between(0.3, 0.8)}  # fmt: skip
+    held = street.roadside.model_dump()
+    held |= {"signals": signals, "lamp_posts": lamps, "overheads": [bridge] if random.random() < 0.3 else []}
+    road = street.road.model_dump() | {"stains": stains, "potholes": potholes}
+    return street.changed(id=f"lookalikes-{seed}", roadside=held, road=road)
+
+
 def _large_or_small(random: np.random.Generator, station_m: float) -> dict[str, Any]:
     shape = str(random.choice(["rectangle", "rectangle", "rectangle", "round", "octagon", "diamond", "triangle"]))
     wide = tall = float(np.exp(random.uniform(np.log(0.5), np.log(1.5))))

@@ -89,6 +89,7 @@ def fit(segments: Iterable[Segments], *, increasing: Sequence[str] = (), decreas
         "offset": _short(offset), "slope": _short(slope),
         "record": {
             "lightgbm": lightgbm.__version__, "settings": settings, "rounds": rounds,
+            "streets": {one: sorted(set(group[source == one].tolist())) for one in sorted(set(source))},
             "held out": {
                 one: _figures(offset + slope * outside[source == one], true[source == one])
                 for one in sorted(set(source))

@@ -79,6 +79,17 @@ def motorway(length_m: float = 180.0) -> Scene:
     )  # fmt: skip
 
 
+def seen_by(model: str, scene: Scene, *, pitch_deg: float | None = None) -> Scene:
+    """The scene as another lidar records it, in a bag with the office's trajectory beside it.
+
+    pitch_deg : how far it leans back (degrees); None: as the scene has it.
+    """
+    lidar = scene.lidar.model_dump() | {"model": model}
+    if pitch_deg is not None:
+        lidar["mount"] |= {"pitch_deg": pitch_deg}
+    return scene.changed(id=f"{scene.id}-{model}", lidar=lidar, bag={"on": True, "trajectory": True})
+
+
 @dataclass(frozen=True, eq=False)
 class Street:
     """A street that was processed, and what is true of it."""

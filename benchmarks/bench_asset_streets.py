@@ -14,19 +14,30 @@ from typing import Final
 import numpy as np
 
 from benchmarks.asset_scores import figures_of, sign_errors
-from benchmarks.asset_streets import motorway, processed, town
+from benchmarks.asset_streets import motorway, processed, seen_by, town
 from benchmarks.drawn_streets import street_of_signs
 from benchmarks.settings import bench_folder
 from benchmarks.timing import Figure
+from roadscan.simulate import Scene
 
 SIGNS_OF: Final = range(60, 72)
 _SETTINGS: Final = "kinds = ['sign']\nclassified = false\nbare_earth = false\nexports = []\n"
 _SPOT_DEG: Final = 0.17
 
 
+def scenes() -> Iterator[tuple[str, Scene]]:
+    """The town street in both directions, the motorway in two of its lanes, and parts of both as others see them."""
+    yield "town", town()
+    yield "motorway", motorway()
+    for model in ("VLP-16", "OS1-128"):
+        yield f"town, {model}", seen_by(model, town(100.0))
+        yield f"motorway, {model}", seen_by(model, motorway(120.0))
+    yield "town, HDL-32E upright", seen_by("HDL-32E", town(100.0), pitch_deg=0.0)
+
+
 def figures(folder: Path) -> Iterator[Figure]:
-    """The town street in both directions, the motorway in two of its lanes, then streets of signs."""
-    for name, scene in (("town", town()), ("motorway", motorway())):
+    """Figures of whole streets, then of streets of signs."""
+    for name, scene in scenes():
         for figure in figures_of(processed(scene, bench_folder(folder) / f"assets-{name}")):
             yield replace(figure, what=f"{name}, {figure.what}", against="" if figure.other is None else "the bar")
     yield from sizes_of_signs(folder, 0.0, "drawn signs")

@@ -95,7 +95,7 @@ class Pass:
             yield SimulatedLog(name, write, "poses", "pose_quaternions", None, clock, "local", options)
             return
         right = SensorClock.of(scene, ClockError(), TimeSystem.GPS_WEEK)
-        if scene.bag.on:  # a rig that records a bag has no office's trajectory: this one is for the truth
+        if scene.bag.on and not scene.bag.trajectory:  # this one is for the truth
             yield SimulatedLog(name, write, "poses")
             return
         clock = right.toml(None, trajectory.first_gps_ns(scene, drive))

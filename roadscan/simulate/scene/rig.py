@@ -357,6 +357,8 @@ class Bag(Strict):
     """Messages of a Mid-360: those of Livox's driver, or clouds like the other lidars'."""
     odometry: Odometry = Odometry()
     """Poses of an odometry."""
+    trajectory: bool = False
+    """Whether the office's trajectory lies beside the bag."""
     delay_s: float = Field(default=0.01, ge=0.0)
     """Mean time from when a message is whole to its arrival at the recording computer; single ones vary by half (s)."""
 

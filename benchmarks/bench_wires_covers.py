@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import shapely
 
-from benchmarks.drawn_streets import street_of_covers
+from benchmarks.drawn_streets import street_of_covers, street_of_lookalikes
 from benchmarks.hard_streets import hard_street
 from benchmarks.labelled_street import run
 from benchmarks.timing import Figure
@@ -28,7 +28,8 @@ Float64 = npt.NDArray[np.float64]
 
 HARD: Final = (62, 64, 65, 66, 67, 68, 69, 70)
 COVERED: Final = {700: "HDL-32E", 701: "OS1-128", 702: "HDL-32E", 703: "OS1-128"}
-"""Seeds of hard streets, and of streets with many covers and wires, with their lidar."""
+LOOKALIKES: Final = {720: "HDL-32E", 721: "OS1-128", 722: "HDL-32E", 723: "OS1-128"}
+"""Seeds of hard streets, of streets with many covers and wires with their lidar, and of such with what is like them."""
 _WIRE_M, _COVER_M = 0.3, 0.35
 """A span is right where half of it lies within this of a wire (m), a cover within that of one."""
 
@@ -54,11 +55,14 @@ class Score:
 
 
 def figures(folder: Path) -> Iterator[Figure]:
-    """Both sorts of streets."""
-    covered = {seed: _recorded(street_of_covers(seed), model) for seed, model in COVERED.items()}
+    """All sorts of streets."""
     sorts: Mapping[str, Mapping[int, Scene]] = {
-        "streets of covers": covered, "hard streets": {seed: hard_street(seed) for seed in HARD}
-    }  # fmt: skip
+        "streets of covers": {seed: _recorded(street_of_covers(seed), model) for seed, model in COVERED.items()},
+        "streets of what is like covers and wires": {
+            seed: _recorded(street_of_lookalikes(seed), model) for seed, model in LOOKALIKES.items()
+        },
+        "hard streets": {seed: hard_street(seed) for seed in HARD},
+    }
     for name, streets in sorts.items():
         total = sum((score(one, folder / f"{name} {seed}") for seed, one in streets.items()), Score())
         yield Figure(f"{name}: wires of {total.wires_m:.0f} m, found", total.covered_m / total.wires_m, "")

@@ -31,8 +31,9 @@ from roadscan.tiles.tasks.tile_plan import plan_tiles
 from tests.adjust.adjusted_site import CIRCLES, NO_FILES, TARGETS, adjust, cell_errors, corrections, rows, site
 from tests.surveys import Lines, Simulated, changed
 
+pytestmark = pytest.mark.slow
 
-@pytest.mark.slow
+
 def test_surface_and_check_points_come_to_the_truth(adjusted: Simulated) -> None:
     recorded = Simulated(adjusted.survey_file)
     recorded.run("store-recorded", adjust__on=False, **NO_FILES)
@@ -130,7 +131,6 @@ class Shuffled:
             yield Done(task, function(task), None)
 
 
-@pytest.mark.slow
 def test_workers_order_and_a_killed_run_change_no_bit(adjusted: Simulated, tmp_path: Path) -> None:
     copy = adjusted.copy_with_store_to(tmp_path / "survey")
     store = copy.store()
@@ -232,7 +232,6 @@ def raised(points: dict[str, dict[str, str]], name: str, by_m: float) -> None:
     points[name]["height_m"] = f"{float(points[name]['height_m']) + by_m:.4f}"
 
 
-@pytest.mark.slow
 @pytest.mark.witness("control_point")
 def test_a_control_point_that_is_wrong_by_50_mm_is_named_and_bends_nothing(adjusted: Simulated, tmp_path: Path) -> None:
     before = rows(adjusted.store(), "FROM control_residuals WHERE role = 'check' ORDER BY point, run")
@@ -248,7 +247,6 @@ def test_a_control_point_that_is_wrong_by_50_mm_is_named_and_bends_nothing(adjus
     assert {row["name"] for row in weights if row["weight_height"] == 0.0} == {"G003"}
 
 
-@pytest.mark.slow
 def test_heights_that_were_exchanged_are_named(adjusted: Simulated, tmp_path: Path) -> None:
     def exchange(points: dict[str, dict[str, str]]) -> None:
         one, other = points["G001"], points["G006"]
@@ -259,7 +257,6 @@ def test_heights_that_were_exchanged_are_named(adjusted: Simulated, tmp_path: Pa
     assert [line for line in run.reporter.lines if "the heights of G001 and G006 look exchanged" in line]
 
 
-@pytest.mark.slow
 def test_control_in_another_height_datum_is_named_and_not_used(adjusted: Simulated, tmp_path: Path) -> None:
     def geoid(points: dict[str, dict[str, str]]) -> None:
         for name in points:
@@ -272,7 +269,6 @@ def test_control_in_another_height_datum_is_named_and_not_used(adjusted: Simulat
     assert moved < 0.1  # passes are still tied to one another
 
 
-@pytest.mark.slow
 def test_one_point_in_another_datum_and_one_elsewhere(adjusted: Simulated, tmp_path: Path) -> None:
     def other(points: dict[str, dict[str, str]]) -> None:
         raised(points, "G001", 45.3)
@@ -327,7 +323,6 @@ def test_a_point_of_the_lane_beside_that_nobody_drove_is_no_fault(adjusted: Simu
     assert any("4 of 6 control points seen" in line for line in lines)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["each_pass", "vertical", "helmert"])
 def test_every_mode_improves_the_check_points(adjusted: Simulated, tmp_path: Path, mode: str) -> None:
     copy = adjusted.copy_with_store_to(tmp_path / "survey")
@@ -352,7 +347,6 @@ def test_a_survey_without_overlap_and_control_is_told_so(raw_site: Simulated, tm
     assert not copy.store().exists(small_path("corrections"))
 
 
-@pytest.mark.slow
 @pytest.mark.witness("corrected_elsewhere")
 def test_corrections_of_another_program_stay(adjusted: Simulated, tmp_path: Path) -> None:
     copy = adjusted.copy_with_store_to(tmp_path / "survey")
@@ -368,7 +362,6 @@ def test_corrections_of_another_program_stay(adjusted: Simulated, tmp_path: Path
     assert rows(store, "SELECT DISTINCT run FROM corrections ORDER BY run") == [{"run": f"run-{k}"} for k in (1, 2, 3)]
 
 
-@pytest.mark.slow
 def test_a_control_point_whose_place_is_wrong_is_named_and_bends_nothing(adjusted: Simulated, tmp_path: Path) -> None:
     before = rows(adjusted.store(), "FROM control_residuals WHERE role = 'check' ORDER BY point, run")
 
@@ -385,7 +378,6 @@ def test_a_control_point_whose_place_is_wrong_is_named_and_bends_nothing(adjuste
     assert weights == [{"name": "G003"}]
 
 
-@pytest.mark.slow
 @pytest.mark.witness("control_target")
 def test_a_target_that_lies_elsewhere_is_measured_where_it_lies(adjusted: Simulated, tmp_path: Path) -> None:
     """One stated 0.3 m from its paint, then all of them: no height moves, though the road falls by some mm there."""
@@ -417,7 +409,6 @@ def test_a_target_that_lies_elsewhere_is_measured_where_it_lies(adjusted: Simula
     assert not [line for line in every if "its surveyed place lies" in line]
 
 
-@pytest.mark.slow
 def test_targets_picked_by_hand_stand_in_for_those_that_would_be_found(adjusted: Simulated, tmp_path: Path) -> None:
     """A tester picks the true places as the recorded poses show them: the check points come as near as by finding."""
     found = rows(adjusted.store(), "FROM control_residuals ORDER BY point, run")

@@ -85,6 +85,7 @@ def test_markings_of_a_long_bend() -> None:
     assert f1_of_cells(scene, known.on_paint, on_ground(scene)) >= 0.95  # 0.89 where lines are judged as a whole
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("one", [highway, pytest.param(town, marks=pytest.mark.nightly)])
 def test_markings_of_simulated_streets(one: Callable[[], SimulatedStreet]) -> None:
     known = one()

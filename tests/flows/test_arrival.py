@@ -31,6 +31,8 @@ from tests.flows.arriving import Fleet, manifest_of
 from tests.flows.prefect_server import PrefectApi
 from tests.object_store import served
 
+pytestmark = pytest.mark.slow
+
 LATE = "run-1/trajectory.sbet"
 """The log that is uploaded last."""
 
@@ -161,7 +163,6 @@ def runs(client: SyncPrefectClient, fleet: Fleet) -> dict[str, FlowRun]:
     return {run.name: run for run in mine}
 
 
-@pytest.mark.slow
 def test_a_complete_folder_is_started_once(fleet: Fleet, client: SyncPrefectClient) -> None:
     fleet.upload("drive-1")
     fleet.upload("urgent-2")
@@ -178,7 +179,6 @@ def test_a_complete_folder_is_started_once(fleet: Fleet, client: SyncPrefectClie
 # --- from raw logs to a page --------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("prefect_api")
 def test_from_raw_logs_to_a_page(fleet: Fleet) -> None:
     (fleet.upload("drive-1") / "MANIFEST.csv").write_bytes(manifest_of(fleet.raw))
@@ -190,7 +190,6 @@ def test_from_raw_logs_to_a_page(fleet: Fleet) -> None:
     assert (home / "inventory.gpkg").is_file()
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("client")
 def test_what_the_template_leaves_open_is_named(fleet: Fleet) -> None:
     fleet.upload("drive-1")
@@ -240,7 +239,6 @@ class TriedError(Exception):
     """The last try failed as well."""
 
 
-@pytest.mark.slow
 def test_a_bucket_that_does_not_answer_is_tried_again(
     fleet: Fleet, prefect_api: PrefectApi, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -280,7 +278,6 @@ def test_a_store_that_another_run_has_is_tried_again(survey_file: Path, prefect_
     assert tried(check, 5, lambda tries: other.__exit__(None, None, None) if tries == 3 else None) == 3
 
 
-@pytest.mark.slow
 def test_what_stays_wrong_is_not_tried_again(fleet: Fleet, survey_file: Path, prefect_api: PrefectApi) -> None:
     survey = Survey.load(survey_file)
     store = Store(survey.store_url, survey.config.id)

@@ -17,6 +17,8 @@ from typer.testing import CliRunner
 
 from roadscan.cli import app
 
+pytestmark = pytest.mark.slow
+
 UNDULATION_M = {"a": 45.0, "b": 40.0}
 """Of the grid `region.gtx` of each survey."""
 EAST_M, NORTH_M, HEIGHT_M = 500_000.0, 5_316_000.0, 300.0
@@ -61,13 +63,11 @@ def of_a_b(folder: Path, *more: str) -> list[float]:
     return found
 
 
-@pytest.mark.slow
 def test_two_surveys_of_one_process_have_their_own_grids(two: Path) -> None:
     a, b = of_a_b(two)
     assert b - a == pytest.approx(5.0, abs=2e-3)
 
 
-@pytest.mark.slow
 def test_two_surveys_on_one_worker_have_their_own_grids(two: Path, scheduler: str) -> None:
     a, b = of_a_b(two, "--scheduler", scheduler)
     assert b - a == pytest.approx(5.0, abs=2e-3)

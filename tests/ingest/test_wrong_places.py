@@ -374,6 +374,7 @@ def test_recordings_raise_no_doubt(recordings: Path, tmp_path: Path) -> None:
         assert found.stalls == (), log.path
 
 
+@pytest.mark.slow
 def test_a_simulated_drive_raises_no_doubt(simulated: Simulated, tmp_path: Path) -> None:
     """Poses of the simulator with their noise, profiles and returns."""
     told = command("ingest", simulated.copy_to(tmp_path / "survey").survey_file.parent)

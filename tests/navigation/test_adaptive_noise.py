@@ -62,6 +62,7 @@ def test_sigma_of_a_walk_is_honest_in_outages(sigma_factor: float) -> None:
         assert np.sqrt(one[0]).max() < 0.1
 
 
+@pytest.mark.slow
 def test_stated_noise_is_not_honest_on_a_walk() -> None:
     """What the tests above hold against: the constraints of a vehicle, and a receiver that is believed."""
     walk = walked(1)

@@ -18,6 +18,8 @@ from roadscan.run.session import Session
 from roadscan.survey.status import survey_status
 from tests.real_data.conftest import Place
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def drive(place: Place) -> road_cells.Drive:
@@ -30,7 +32,6 @@ def points(place: Place, kitti: Path, drive: road_cells.Drive) -> pd.DataFrame:
     return road_cells.label(road_cells.locate(read_points(place.products(kitti)), drive), drive)
 
 
-@pytest.mark.slow
 def test_every_return_is_accounted_for(place: Place, kitti: Path, points: pd.DataFrame) -> None:
     recorded = sum(f.stat().st_size for f in place.unpacked.glob("kitti_drive/velodyne_points/data/*.bin")) // 16
     (lidar,) = (r for r in place.records(kitti) if r.sensor == "velodyne")
@@ -44,7 +45,6 @@ def test_every_return_is_accounted_for(place: Place, kitti: Path, points: pd.Dat
     assert status.readings["no_pose"] < 0.02 * recorded
 
 
-@pytest.mark.slow
 def test_the_sweeps_agree_on_the_road(points: pd.DataFrame) -> None:
     """Published poses give 0.027 m (population) before any adjustment."""
     beside = road_cells.beside_car(points)
@@ -57,7 +57,6 @@ def test_the_sweeps_agree_on_the_road(points: pd.DataFrame) -> None:
     assert any_height.std_population_m.median() <= 0.03
 
 
-@pytest.mark.slow
 def test_the_spread_is_the_poses_drift_in_height(points: pd.DataFrame) -> None:
     """One constant height a sweep, and the road agrees to 1 cm: neither mounting nor georeferencing blurs it."""
     heights = road_cells.cell_heights(points[road_cells.is_road(points)])
@@ -67,7 +66,6 @@ def test_the_spread_is_the_poses_drift_in_height(points: pd.DataFrame) -> None:
     assert cells.std_m.median() < 0.011
 
 
-@pytest.mark.slow
 def test_returns_in_labelled_boxes_are_counted(points: pd.DataFrame, drive: road_cells.Drive) -> None:
     raw = road_cells.recorded_in_boxes(drive)
     near = raw[(raw.frame % 15 == 0) & (raw.distance_m < 40)].returns
@@ -99,7 +97,6 @@ def test_geotiff_counts_the_points_of_the_las(place: Place, kitti: Path) -> None
     assert np.nanmin(height) >= las.z.min() - 1e-4
 
 
-@pytest.mark.slow
 def test_products_of_the_whole_drive(place: Place, kitti: Path, points: pd.DataFrame) -> None:
     products = place.products(kitti) / "products"
     with (

@@ -95,6 +95,7 @@ def test_shuffled_row_groups_of_the_tables_change_no_byte(finished: Simulated, t
     assert results[0] == results[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("times", [4, pytest.param(10, marks=pytest.mark.nightly)])
 def test_killed_and_resumed_at_random_points(finished: Simulated, tmp_path: Path, times: int) -> None:
     copy = finished.copy_to(tmp_path / "survey")

@@ -137,6 +137,7 @@ def walkway(ramp: bool) -> Scene:
     return make_scene(returns, box, box, drive)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ramp", [False, True])
 def test_a_sidewalk_has_slopes_a_kerb_and_a_ramp_where_its_kerb_is_dropped(ramp: bool) -> None:
     kind = Sidewalk()

@@ -21,6 +21,7 @@ def test_the_end_of_an_arm_has_a_height_where_its_last_return_lies_apart(count: 
     assert height_m == 5.2
 
 
+@pytest.mark.slow
 def test_a_post_before_a_front_is_no_tree_where_the_sun_makes_false_returns() -> None:
     street = Scene.model_validate(
         {

@@ -36,6 +36,7 @@ from roadscan.core.gpstime import Clock, TimeSystem, gps_ns_from_utc
 from roadscan.core.grid import TileGrid, TileId
 from roadscan.core.survey import Survey, survey_file_model
 from roadscan.ingest.reading.format import LogSource, Reject, Rows, format_of, log_formats
+from roadscan.ingest.sources import claims_digest
 from roadscan.report.section import sections
 from roadscan.run.session import Session
 from roadscan.run.stage import stages
@@ -370,6 +371,7 @@ def plugin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def _look_again() -> None:
     """Let what is installed be found anew."""
     for found in (
+        claims_digest,
         log_formats,
         products,
         stages,

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.drawn_streets import street_of_covers, street_of_lookalikes
+from benchmarks.drawn_streets import street_of_covers
 from benchmarks.hard_streets import hard_street
 from benchmarks.judgement import Segments
 from benchmarks.labelled_returns import LabelledReturns, labelled_returns, scene_about
@@ -24,8 +24,7 @@ from roadscan.assets.scene import Scene
 
 HARD: Final = range(26)
 COVERED: Final = range(500, 516)
-LOOKALIKES: Final = range(540, 552)
-"""Seeds of hard streets, of streets with wires and covers, and of such with stains, potholes and arms."""
+"""Seeds of hard streets, and of streets with wires and covers."""
 _KNOWN: Final = (*range(10, 33), 50, 51, 70, 71, 80, 81)
 """Labels of what is no wire."""
 _PART_S: Final = 1.5
@@ -48,11 +47,7 @@ def segments(folder: Path) -> Iterator[Segments]:
 
 def streets() -> Iterator[tuple[str, LabelledReturns]]:
     """Streets by name."""
-    drawn = (
-        ("hard", HARD, hard_street), ("covers", COVERED, street_of_covers),
-        ("lookalikes", LOOKALIKES, street_of_lookalikes),
-    )  # fmt: skip
-    for name, seeds, draw in drawn:
+    for name, seeds, draw in (("hard", HARD, hard_street), ("covers", COVERED, street_of_covers)):
         for seed in seeds:
             yield f"{name} {seed}", labelled_returns(draw(seed))
 

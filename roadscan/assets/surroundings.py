@@ -59,6 +59,9 @@ _CORRIDOR_M: Final = 1.5
 """Half width of the corridor of a drive (m)."""
 _LEAST_CELLS: Final = 4
 """Least number of cells of the corridor under a structure."""
+_LEAST_KNOWN: Final = 4
+"""Fewer returns in a cube and those around lie in a plane whatever they hit: false ones of the sun's light would hang
+together with crowns and span the road."""
 _PLANAR: Final = 0.4  # Least planarity of a cube of a deck or of a wall.
 _UPRIGHT: Final = 0.25  # Least upward part of the normal of a deck, greatest of that of a wall.
 _BELOW_CUBES, _ABOVE_CUBES = 1, 4
@@ -87,9 +90,10 @@ def overhead_classes(
     row, column, layer = cubes.place.T
     if not (high & corridor[row, column]).any():
         return out
-    level = high & (cubes.features[:, voxels.PLANARITY] >= _PLANAR)
+    known = high & (cubes.features[:, voxels.NUMBER] >= _LEAST_KNOWN)
+    level = known & (cubes.features[:, voxels.PLANARITY] >= _PLANAR)
     level &= cubes.features[:, voxels.NORMAL_UP] > _UPRIGHT
-    hanging = (high & ~leafy) | level
+    hanging = (known & ~leafy) | level
     cells = np.zeros(grid.shape, np.uint8)
     cells[row[hanging], column[hanging]] = 1
     count, label = cv2.connectedComponents(cv2.morphologyEx(cells, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8)))

@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks.judged_scenes import simulated
 from benchmarks.labelled_returns import labelled_returns
+from roadscan.assets.classes import OVERHEAD_STRUCTURE
 from roadscan.assets.upright.standing import _reach
 from roadscan.simulate import Scene
 from tests.assets.upright.scene import objects_of
@@ -40,6 +41,7 @@ def test_a_post_before_a_front_is_no_tree_where_the_sun_makes_false_returns() ->
     )  # fmt: skip
     seen = labelled_returns(street)
     scene = simulated(street, "hard", 1.0, seen).scene
+    assert not (scene.classes == OVERHEAD_STRUCTURE).any()  # false returns do not join a crown to what spans the road
     for kind, offset_m in (("pole", -8.0), ("tree", 8.0)):
         (found,) = (np.array([one.geometry.x, one.geometry.y]) for one in objects_of(scene, kind))
         assert abs(float(seen.surface.station_offset_m(*found[:, None])[1][0]) - offset_m) < 0.1

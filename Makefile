@@ -61,7 +61,7 @@ nightly: $(VENV)/.installed-dev  ## What takes too long for every change: fuzz, 
 	$(BIN)/python -m pytest -q -n 2 -m nightly --timeout=1800 $(PYTEST_ARGS)
 
 test-library: export ROADSCAN_CODECS := library
-test-library: pytest  ## Tests with libraries in place of the own codecs.
+test-library: pytest slow  ## Tests with libraries in place of the own codecs.
 
 fuzz: $(VENV)/.installed-dev  ## Every reader on 10,000 damaged files (an hour or two); FUZZ_ARGS="--format sbet" narrows it.
 	$(BIN)/python -m tests.fuzz --mutants 10000 $(FUZZ_ARGS)

@@ -18,6 +18,7 @@ import shapely
 from benchmarks.asset_streets import LOW_POST_M, Street
 from benchmarks.timing import Figure
 from roadscan.assets import classes
+from roadscan.assets.kinds.street_furniture import JUDGES
 
 Float64 = npt.NDArray[np.float64]
 
@@ -40,7 +41,7 @@ NONE_THERE: Final = ("wall", "barrier", "attenuator", "median")
 """Kinds that the streets lack, but for boxes."""
 _MANHOLE_M: Final = 1.0
 """A round patch that is no wider is a manhole's cover."""
-_FURNITURE: Final = ("cabinet", "bin", "litter_bin", "bench", "hydrant", "bus_shelter")
+_FURNITURE: Final = (*JUDGES, "litter_bin")
 
 
 class Judged(NamedTuple):

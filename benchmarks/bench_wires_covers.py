@@ -1,6 +1,6 @@
 """Wires and covers from what ``roadscan run`` wrote with default settings, on drawn streets that no judge has seen.
 
-Streets are those whose lidar records packets: one that records a bag has no trajectory of an office.
+Their lidars record packets: of the hard streets only those are taken, and others get such a lidar.
 """
 
 from __future__ import annotations

@@ -153,7 +153,7 @@ def straight_lines(groups: Groups, which: Bool) -> Bool:
         part = _part(groups.boxes[k], 0)
         inside = groups.label[part] == groups.number[k]
         row, column = np.nonzero(inside)
-        free, x, y = at_the_rim(inside)[row, column], column.astype(np.float64), row.astype(np.float64)
+        free, x, y = _at_the_rim(inside)[row, column], column.astype(np.float64), row.astype(np.float64)
         for _ in range(_MOST_LINES if row.size <= _MOST_CELLS else 0):
             line = np.zeros(row.size, np.bool_)
             if columns.straight_run(x, y, free, _LINE_ANGLES, _LINE_GAP, line) < _LINE_CELLS:
@@ -163,7 +163,7 @@ def straight_lines(groups: Groups, which: Bool) -> Bool:
     return out
 
 
-def at_the_rim(inside: Bool) -> Bool:
+def _at_the_rim(inside: Bool) -> Bool:
     """Returns the cells of a group with room beside them: no line runs across the roofs of cars that touch each other.
 
     inside : (rows, columns), and so is what is returned. A hole of one cell in a body is none.

@@ -9,8 +9,8 @@ its making can come across the edited lines.
 
 A definition counts by its shape: its syntax tree, in which each definition of ours that it names is a number, in the
 order in which they are reached. So comments, docstrings, line breaks, the file in which a definition stands and its
-name do not count: to move or to rename one leaves every output current. Names of attributes, of arguments and of local
-variables count.
+name do not count: to move or to rename one leaves every output current, but where modules are joined that both import
+a type of arrays (`ARRAY_TYPES`). Names of attributes, of arguments and of local variables count.
 
 What is found by looking into a folder or at an entry point (formats, products, stages) is not reached, since no name
 leads there: each of these belongs to the keys of its own outputs.

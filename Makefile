@@ -25,7 +25,7 @@ demo: $(VENV)/.installed  ## Simulate a small survey, process it, compare with i
 	$(BIN)/roadscan demo --out demo
 
 # Types take one processor for as long as a tenth of the tests: the tests begin beside them, when the other checks are through.
-test: $(VENV)/.installed-dev  ## What every change passes within ten minutes: check, and the tests that are not slow.
+test: $(VENV)/.installed-dev  ## What every change passes: check, and the tests that are not slow.
 	@$(MAKE) --no-print-directory --jobs 2 check pytest
 
 check: lint types contracts house docs-check  ## Lint, types, import contracts, documentation.

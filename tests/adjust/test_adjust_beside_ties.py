@@ -26,6 +26,8 @@ from roadscan.store.store import Store
 from tests.adjust.adjusted_site import CIRCLES, NO_FILES, OFF, adjust, cell_errors, corrections, rows
 from tests.surveys import Simulated, changed
 
+pytestmark = pytest.mark.slow
+
 STAGES = ("ingest", "navigate", "footprints", "adjust")
 AZIMUTH = np.radians(128.0)
 """Of the site's road."""
@@ -78,7 +80,6 @@ def true_errors(one: Simulated, run: str, corrected: bool) -> npt.NDArray[np.flo
     return np.asarray((error + np.stack(added, axis=-1))[inside])
 
 
-@pytest.mark.slow
 def test_a_run_that_is_held_keeps_its_poses_and_the_others_come_to_it(adjusted: Simulated, tmp_path: Path) -> None:
     copy = adjusted.copy_with_store_to(tmp_path / "survey")
     run = adjust(copy, adjust__fixed=["run-1"])
@@ -108,7 +109,6 @@ def test_a_run_that_is_held_keeps_its_poses_and_the_others_come_to_it(adjusted: 
     assert not findings(store, "run_not_held")
 
 
-@pytest.mark.slow
 @pytest.mark.witness("fixed_run")
 def test_a_run_that_is_held_and_lies_elsewhere_than_its_sigma_says_is_named(
     adjusted: Simulated, tmp_path: Path
@@ -154,7 +154,6 @@ def hand_ties(one: Simulated, change: Callable[[list[dict[str, object]]], None])
         out.writerows(ties)
 
 
-@pytest.mark.slow
 @pytest.mark.witness("hand_tie")
 def test_ties_by_hand_bring_passes_together_and_one_that_is_wrong_is_named(adjusted: Simulated, tmp_path: Path) -> None:
     """Two passes whose shifts are not sought: nothing but the ties by hand tells of their place."""
@@ -249,7 +248,6 @@ def test_ties_that_still_move_after_the_last_round_are_told(adjusted: Simulated,
     assert "after ties were observed again 1 time " in found[0].text
 
 
-@pytest.mark.slow
 @pytest.mark.witness("ties_fail")
 def test_passes_whose_ties_mostly_fail_are_named_with_the_reason(adjusted: Simulated, tmp_path: Path) -> None:
     """Half a metre in height, and nothing is sought farther apart."""
@@ -275,7 +273,6 @@ def write_line(one: Simulated, aside_m: float) -> None:
 LINES = {"path": "lines.csv", "format": "control_lines", "crs": "EPSG:25833", "height": "ellipsoidal"}
 
 
-@pytest.mark.slow
 def test_a_surveyed_line_brings_passes_without_accurate_positions_across_the_road(
     adjusted: Simulated, tmp_path: Path
 ) -> None:
@@ -299,7 +296,6 @@ def test_a_surveyed_line_brings_passes_without_accurate_positions_across_the_roa
     assert sigma.max() > 0.05  # along the road nothing is told
 
 
-@pytest.mark.slow
 @pytest.mark.witness("control_line")
 def test_a_surveyed_line_that_is_wrong_is_named_and_bends_nothing(adjusted: Simulated, tmp_path: Path) -> None:
     before = rows(adjusted.store(), "FROM control_residuals WHERE role = 'check' ORDER BY point, run")

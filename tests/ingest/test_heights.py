@@ -75,6 +75,7 @@ def test_a_cloud_that_states_no_height_is_asked(faults: Path, tmp_path: Path, lo
     assert lon_lat == pytest.approx((-123.07, 44.06), abs=0.02)  # Autzen stadium, Eugene
 
 
+@pytest.mark.slow
 @pytest.mark.witness("height_contradicted")
 def test_geotiff_keys_state_orthometric_feet(faults: Path, tmp_path: Path) -> None:
     file = faults / "mississippi_navd88_feet_keys.las"

@@ -27,6 +27,8 @@ from roadscan.tiles.products.geo_table import write_geo_table
 from roadscan.tiles.tasks.wanted_products import product_context
 from tests.surveys import Simulated
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def session(finished: Simulated, tmp_path: Path) -> Session:
@@ -78,7 +80,6 @@ def test_rows_have_heights_accuracy_epochs_and_severity(session: Session) -> Non
     assert 0.0 < rows[0]["sigma_horizontal_m"] < 0.1 and rows[0]["probability"] is None
 
 
-@pytest.mark.slow
 def test_the_page_shows_them_from_the_inventory_once_that_holds_them(session: Session) -> None:
     def shown() -> dict[str, str]:
         return {one.name: one.group for one in site_layers(Material(session))[0] if one.group == "distress"}

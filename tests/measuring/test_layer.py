@@ -23,6 +23,8 @@ from tests.measuring.drive import FOCAL, HEIGHT, WIDTH, Drive
 from tests.surface.test_surfaces import TwoThreads
 from tests.surveys import Lines
 
+pytestmark = pytest.mark.slow
+
 FOLDER = "store/survey=demo/products/pictures"
 
 
@@ -41,7 +43,6 @@ def layer(measured_drive: Drive) -> geopandas.GeoDataFrame:
     return geopandas.read_parquet(file)
 
 
-@pytest.mark.slow
 def test_places_and_orientations_are_the_true_ones(measured_drive: Drive, layer: geopandas.GeoDataFrame) -> None:
     assert set(layer["focal_x_px"]) == {FOCAL} and set(layer["width_px"]) == {WIDTH}
     assert list(layer["file"]) == list(measured_drive.poses) and layer["without_pose"].isna().all()
@@ -72,7 +73,6 @@ def test_places_and_orientations_are_the_true_ones(measured_drive: Drive, layer:
         assert abs((dt.datetime.fromisoformat(row.utc) - moment).total_seconds()) < 2e-6
 
 
-@pytest.mark.slow
 def test_sigma_is_what_trajectory_and_mounting_state(measured_drive: Drive, layer: geopandas.GeoDataFrame) -> None:
     """The simulator's logs state 1 mm and 0.0005°, 0.001° of heading; the rig file states none of its mounting."""
     row = layer.iloc[1]
@@ -84,7 +84,6 @@ def test_sigma_is_what_trajectory_and_mounting_state(measured_drive: Drive, laye
     assert 0.0 < row["sigma_phi_deg"] < 0.01 and 0.0 < row["sigma_kappa_deg"] < 0.01
 
 
-@pytest.mark.slow
 def test_footprints_hold_what_the_pictures_show(measured_drive: Drive, layer: geopandas.GeoDataFrame) -> None:
     corners, count = measured_drive.corners(), np.zeros(2, int)
     for row in layer.itertuples():
@@ -104,7 +103,6 @@ def test_footprints_hold_what_the_pictures_show(measured_drive: Drive, layer: ge
     assert layer["footprint_on_ground"].between(0.0, 1.0).all() and layer["footprint_on_ground"].max() > 0.3
 
 
-@pytest.mark.slow
 def test_the_geopackage_holds_the_same(measured_drive: Drive, layer: geopandas.GeoDataFrame) -> None:
     file = measured_drive.survey_file.parent / FOLDER / "pictures.gpkg"
     assert dict(pyogrio.list_layers(file)) == {

@@ -72,6 +72,7 @@ def test_stated_noise_is_not_honest_on_a_walk() -> None:
     assert outliers(solve(believed.imu, believed.masked, None, believed.vehicle, WALKER)) > 0.2
 
 
+@pytest.mark.slow
 def test_sigma_of_a_recorded_drive_is_honest_in_outages(recordings: Path) -> None:
     """Eleven outages of 15 s of a car; withheld solutions that are not fixed say nothing (theirs err by 0.25 m).
 

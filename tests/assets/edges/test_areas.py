@@ -151,6 +151,7 @@ def test_a_sidewalk_has_slopes_a_kerb_and_a_ramp_where_its_kerb_is_dropped(ramp:
         assert abs(one.attributes["running_slope"]) == pytest.approx(0.03, abs=0.006)
 
 
+@pytest.mark.slow
 def test_a_road_may_have_edges_on_one_side_alone() -> None:
     kind = RoadEdge()
     pieces = kind.evidence(island(2.4, 0.15), RoadEdgeOptions()).pieces

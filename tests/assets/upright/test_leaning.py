@@ -41,6 +41,7 @@ def scene() -> Scene:
     return make_scene(returns, box, box, drive)
 
 
+@pytest.mark.slow
 def test_a_leaning_pole(scene: Scene) -> None:
     (pole,) = objects_of(scene, "pole")
     assert pole.attributes["lean_deg"] == pytest.approx(LEAN_DEG, abs=0.3)

@@ -331,9 +331,13 @@ def test_every_folder_with_code_is_a_package(tmp_path: Path) -> None:
     assert packages_without_init(tmp_path) == [(tmp_path / "levels").as_posix()]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def plugin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The examples, installed as another package that adds them through entry points."""
+    """The examples, installed for one test as another package that adds them through entry points.
+
+    It is not installed for the whole module: the shared survey, made by whichever test asks for it first, would then
+    know of formats that the next tests do not have.
+    """
     folder = tmp_path_factory.mktemp("plugin")
     blocks = re.findall(r"```python\n# roadscan/([\w/]+)/(\w+)\.py\n(.*?)```", CONTRIBUTING.read_text(), re.DOTALL)
     entries: dict[str, list[str]] = {}

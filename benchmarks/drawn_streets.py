@@ -176,6 +176,38 @@ def street_of_lookalikes(seed: int) -> Scene:
     return street.changed(id=f"lookalikes-{seed}", roadside=held, road=road)
 
 
+SYMBOLS: Final = ("ahead", "left", "right", "ahead_left", "ahead_right", "triangle", "diamond", "bicycle")
+
+
+def street_of_symbols(seed: int) -> Scene:
+    """A drawn street with symbols in both lanes, some worn, and raised markers, seen by one of four lidars."""
+    random = np.random.default_rng([seed, 53])
+    street = drawn_street(seed)
+
+    def between(low: float, high: float) -> float:
+        return float(random.uniform(low, high))
+
+    symbols = []
+    for station, offset in itertools.product(np.arange(3.0, LENGTH_M - 2.0, 6.5), (-1.55, 1.55)):
+        shape = str(random.choice(SYMBOLS))
+        length = between(1.8, 3.0) if shape == "bicycle" else between(2.5, 5.0)
+        width = {"ahead": 0.75, "diamond": 1.2, "bicycle": 1.4}.get(shape, 1.5) * between(0.8, 1.3)
+        symbols.append({
+            "station_m": float(station) + between(-0.5, 0.5), "offset_m": offset + between(-0.2, 0.2), "shape": shape,
+            "facing": str(random.choice(["forward", "backward"])), "length_m": length, "width_m": width,
+            "line_m": between(0.12, 0.25), "worn": between(0.0, 0.3),
+            "head_m": length * between(0.2, 0.35) if shape == "ahead" else between(0.4, 0.8),
+        })  # fmt: skip
+    markers = [
+        {"station_m": float(station), "offset_m": offset, "length_m": 0.11, "width_m": 0.11, "height_m": 0.018,
+         "shade": between(190.0, 255.0), "edge_m": 0.01}
+        for station in np.arange(1.5, LENGTH_M, 3.0) for offset in (-0.4, 3.5)
+    ]  # fmt: skip
+    road = street.road.model_dump() | {"symbols": symbols, "patches": markers, "crosswalks": []}
+    lidar = street.lidar.model_dump() | {"model": str(random.choice(["HDL-32E", "VLP-16", "HDL-64E", "OS1-128"]))}
+    return street.changed(id=f"symbols-{seed}", road=road, lidar=lidar, bag={"on": True})
+
+
 def _large_or_small(random: np.random.Generator, station_m: float) -> dict[str, Any]:
     shape = str(random.choice(["rectangle", "rectangle", "rectangle", "round", "octagon", "diamond", "triangle"]))
     wide = tall = float(np.exp(random.uniform(np.log(0.5), np.log(1.5))))

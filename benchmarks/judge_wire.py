@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from benchmarks.drawn_streets import street_of_covers
+from benchmarks.drawn_streets import street_of_covers, street_of_lookalikes
 from benchmarks.hard_streets import hard_street
 from benchmarks.judgement import Segments
 from benchmarks.labelled_returns import LabelledReturns, labelled_returns, scene_about
@@ -24,7 +24,8 @@ from roadscan.assets.scene import Scene
 
 HARD: Final = range(26)
 COVERED: Final = range(500, 516)
-"""Seeds of hard streets, and of streets with wires and covers."""
+LOOKALIKES: Final = range(540, 556)
+"""Seeds of hard streets, of streets with wires and covers, and of such with what is like them."""
 _KNOWN: Final = (*range(10, 33), 50, 51, 70, 71, 80, 81)
 """Labels of what is no wire."""
 _PART_S: Final = 1.5
@@ -47,7 +48,9 @@ def segments(folder: Path) -> Iterator[Segments]:
 
 def streets() -> Iterator[tuple[str, LabelledReturns]]:
     """Streets by name."""
-    for name, seeds, draw in (("hard", HARD, hard_street), ("covers", COVERED, street_of_covers)):
+    sorts = (("hard", HARD, hard_street), ("covers", COVERED, street_of_covers),
+             ("lookalikes", LOOKALIKES, street_of_lookalikes))  # fmt: skip
+    for name, seeds, draw in sorts:
         for seed in seeds:
             yield f"{name} {seed}", labelled_returns(draw(seed))
 

@@ -14,6 +14,7 @@ from roadscan.simulate.kernels.road import NODE_STEP_M
 from roadscan.simulate.kernels.things import RING_FROM, RING_TO
 from roadscan.simulate.noise import stream
 from roadscan.simulate.scene.road import Alligator, Joints, Patch, Ravelling, Road, Slabs
+from roadscan.simulate.symbols import strips
 
 _FACE_M = 0.001
 """Width of a slab's face, seen from above (m)."""
@@ -254,7 +255,7 @@ def _spilt(road: Road) -> list[list[float]]:
 
 
 def _painted(road: Road) -> list[list[float]]:
-    """Return stop bars, zebra crossings and targets."""
+    """Return stop bars, zebra crossings, symbols and targets."""
     paint = road.brightness.marking
     rows: list[list[float]] = []
     for bar in road.stop_bars:
@@ -266,6 +267,8 @@ def _painted(road: Road) -> list[list[float]]:
             [RECTANGLE, paint, walk.station_m, float(offset), walk.length_m / 2, walk.stripe_m / 2, walk.worn, 0.0]
             for offset in np.arange(left + walk.stripe_m / 2, right, walk.stripe_m + walk.gap_m)
         ]
+    for symbol in road.symbols:
+        rows += [[RECTANGLE, paint, *place, symbol.worn, 0.0] for place in strips(symbol)]
     for target in road.targets:
         place = [target.station_m, target.offset_m]
         half = target.diameter_m / 2

@@ -15,10 +15,11 @@ import shapely
 from roadscan.assets.classes import MARKING
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
 from roadscan.assets.paint.components import CELL_M
-from roadscan.assets.paint.detection import Paint, Patch, height_sigma, paint_of, rows_of_paint
+from roadscan.assets.paint.detection import SYMBOL_M, Paint, Patch, height_sigma, paint_of, rows_of_paint
+from roadscan.assets.paint.symbols import ARROWS, symbol_of
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.slices import places_of
-from roadscan.compute.array_types import Bool, Float64
+from roadscan.compute.array_types import Bool
 
 PATCH_PIECES: Final = pa.schema(
     [
@@ -83,54 +84,30 @@ _MARKER_M: Final = 0.30  # Largest marker (m).
 _BAR_ALONG_M: Final = (0.15, 1.0)  # Extent of a bar along the road (m).
 _BAR_ACROSS_M: Final = 1.0  # Least extent of a bar across the road (m).
 _BAR_FILLED: Final = 0.7  # Least share of its rectangle that a bar covers.
-_ARROW_ALONG_M: Final = (1.2, 8.0)  # Extent of an arrow along the road (m).
-_ARROW_ACROSS_M: Final = (0.25, 2.5)  # Extent of an arrow across the road (m).
-_HEAD_TO_SHAFT: Final = 1.6  # Least ratio of an arrow's head to its shaft.
-_SLICES: Final = 12  # Slices along a shape whose widths are compared.
-_SYMBOL_M: Final = 6.0
-"""Larger shapes (m) are areas."""
+_ARROW_ALONG_M: Final = 1.2  # Least extent of an arrow along the road (m).
 
 
-def type_of(outline: shapely.Geometry, road_rad: float) -> str:
-    """Returns the type of a polygon in the map, where the road runs in a direction (rad, anticlockwise from east)."""
-    turned = _turned(outline, road_rad)
+def told_of(outline: shapely.Geometry, painted: shapely.Geometry, road_rad: float) -> tuple[str, str | None]:
+    """Returns the type of a polygon in the map with its paint, and what an arrow or a symbol shows.
+
+    road_rad : direction of the road (rad, anticlockwise from east).
+    """
+    turned = _turned(painted, road_rad)
     along_min, across_min, along_max, across_max = turned.bounds
     along, across = along_max - along_min, across_max - across_min
     if max(along, across) <= _MARKER_M:
-        return "raised_marker"
+        return "raised_marker", None
     filled = outline.area / max(shapely.minimum_rotated_rectangle(outline).area, 1e-9)
     if (
         _BAR_ALONG_M[0] <= along <= _BAR_ALONG_M[1]
         and across >= max(_BAR_ACROSS_M, 2.0 * along)
         and filled >= _BAR_FILLED
     ):
-        return "stop_bar"
-    if _is_arrow(turned):
-        return "arrow"
-    return "symbol" if max(along, across) <= _SYMBOL_M else "area"
-
-
-def _is_arrow(turned: shapely.Geometry) -> bool:
-    """Returns True for a slim shaft along x with one wide end."""
-    x_min, y_min, x_max, y_max = turned.bounds
-    along, across = x_max - x_min, y_max - y_min
-    slim = _ARROW_ALONG_M[0] <= along <= _ARROW_ALONG_M[1] and _ARROW_ACROSS_M[0] <= across <= _ARROW_ACROSS_M[1]
-    if not slim or along < 1.2 * across:
-        return False
-    widths = _widths(turned)
-    half = _SLICES // 2
-    ends = float(widths[:half].max()), float(widths[half:].max())
-    shaft = float(np.median(widths))
-    other = float(np.median(widths[half:] if ends[0] > ends[1] else widths[:half]))
-    return shaft > 0.0 and max(ends) >= _HEAD_TO_SHAFT * shaft and min(ends) <= 1.35 * max(other, 0.05)
-
-
-def _widths(turned: shapely.Geometry) -> Float64:
-    """Returns the painted width of slices along x."""
-    x_min, y_min, x_max, y_max = turned.bounds
-    edges = np.linspace(x_min, x_max, _SLICES + 1)
-    slices = shapely.box(edges[:-1], y_min, edges[1:], y_max)
-    return np.asarray(shapely.area(shapely.intersection(slices, turned)) / np.diff(edges))
+        return "stop_bar", None
+    shows = symbol_of(turned)
+    if shows in ARROWS and along >= _ARROW_ALONG_M:
+        return "arrow", shows
+    return ("symbol", shows) if max(along, across) <= SYMBOL_M else ("area", None)
 
 
 def _turned(outline: shapely.Geometry, road_rad: float) -> shapely.Geometry:
@@ -142,6 +119,8 @@ def _turned(outline: shapely.Geometry, road_rad: float) -> shapely.Geometry:
 
 
 _TOUCHING_M: Final = 0.03  # Pieces this near to one another (m) touch.
+_WORN_M: Final = 0.3
+"""Paint that is worn across a symbol leaves parts this near to one another (m)."""
 _LINE_HALF_M: Final = 0.1  # Half width of lines that are cut off a marking (m).
 _BAR_GAP_M: Final = 1.2
 """Greatest gap between bars of a crosswalk (m)."""
@@ -168,7 +147,7 @@ def _groups(shapes: npt.NDArray[Any], in_crosswalk: Bool) -> npt.NDArray[np.int6
     tree = shapely.STRtree(shapes)
     one, other = tree.query(shapes, predicate="dwithin", distance=_BAR_GAP_M)
     together = (in_crosswalk[one] & in_crosswalk[other]) | (
-        (shapely.distance(shapes[one], shapes[other]) <= _TOUCHING_M) & (in_crosswalk[one] == in_crosswalk[other])
+        (shapely.distance(shapes[one], shapes[other]) <= _WORN_M) & (in_crosswalk[one] == in_crosswalk[other])
     )
     links = coo_array((np.ones(int(together.sum())), (one[together], other[together])), shape=(len(shapes),) * 2)
     return np.asarray(connected_components(links, directed=False)[1], np.int64)
@@ -182,8 +161,9 @@ def _object(shapes: npt.NDArray[Any], table: pa.Table) -> AssetObject:
     roads = table["road_rad"].to_numpy()
     road = float(roads[np.isfinite(roads)][0]) if np.isfinite(roads).any() else _own_direction(outline)
     bar = _without_lines(outline)
-    if not crosswalk and type_of(bar, road) == "stop_bar":
+    if not crosswalk and told_of(bar, bar, road)[0] == "stop_bar":
         outline = painted = bar
+    kind, shows = ("crosswalk", None) if crosswalk else told_of(outline, painted, road)
     along, across = _extent(outline, road)
     returns = np.maximum(table["returns"].to_numpy(), 1)
     return AssetObject(
@@ -196,7 +176,8 @@ def _object(shapes: npt.NDArray[Any], table: pa.Table) -> AssetObject:
         first_epoch_gps_ns=int(table["first_epoch_gps_ns"].to_numpy().min()),
         last_epoch_gps_ns=int(table["last_epoch_gps_ns"].to_numpy().max()),
         attributes={
-            "type": "crosswalk" if crosswalk else type_of(outline, road),
+            "type": kind,
+            "symbol": shows,
             "length_m": along,
             "width_m": across,
             "area_m2": float(painted.area),

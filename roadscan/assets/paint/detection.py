@@ -21,6 +21,7 @@ from roadscan.assets.classes import ROAD
 from roadscan.assets.judgement.judge import Judge
 from roadscan.assets.paint.components import CELL_M, Component, Contrast, components_of, contrast_of
 from roadscan.assets.paint.stripes import AROUND_M, RoadDirection, Stripe, stripes_of
+from roadscan.assets.paint.symbols import UNKNOWN, symbol_of
 from roadscan.assets.scene import Box, Scene, once_a_scene
 from roadscan.compute.array_types import Bool, Float64, Int64
 
@@ -204,6 +205,10 @@ WIDEST_LINE_M: Final = 0.42  # Widest line (m).
 _STOP_BAR_M: Final = (0.15, 1.0)
 """Narrowest band across the road that is a bar, and shortest (m)."""
 _LEAST_AREA_M2: Final = 0.03  # Least area of a patch (m²).
+SYMBOL_M: Final = 6.0
+"""Larger paint (m) that is no line is an area."""
+_SYMBOL_ACROSS_M: Final = 0.45
+"""Least extent of a symbol across the road (m): worn lines of 0.3 m, the widest but for bars, are told as narrower."""
 _INSIDE_LOGIT, _BESIDE_LOGIT = 1.5, 0.0  # Log odds of paint inside an outline, and beside it.
 _OWN_LOGIT, _NEAR_LOGIT = 2.5, 1.0  # Bounds of the log odds of a return's contrast, and of the mean around it.
 _SPREAD: Final = 0.25
@@ -244,7 +249,9 @@ def paint_of(scene: Scene) -> Paint:
     bands: list[Stripe] = []
     others: list[Component] = []
     for component in judged(scene, found, components_of(found)):
-        stripes = stripes_of(found, component, scene.returns.corner_m, road)
+        stripes = None
+        if not _is_symbol(component, road):
+            stripes = stripes_of(found, component, scene.returns.corner_m, road)
         if stripes is None:
             others.append(component)
         else:
@@ -264,6 +271,22 @@ def paint_of(scene: Scene) -> Paint:
             direction = road.at(float(component.cell_x_m.mean()), float(component.cell_y_m.mean()))
             patches.append(_of_cells(found, component, bool(crossed), direction))
     return Paint(found, tuple(lines), tuple(patches))
+
+
+def _is_symbol(one: Component, road: RoadDirection) -> bool:
+    """Returns whether a component shows a symbol: the shaft of an arrow and the sides of a triangle are bands, too."""
+    x, y = one.cell_x_m - one.cell_x_m.mean(), one.cell_y_m - one.cell_y_m.mean()
+    if max(np.ptp(x), np.ptp(y)) > SYMBOL_M or one.cell.size * CELL_M**2 < _LEAST_AREA_M2:
+        return False
+    direction = road.at(float(one.cell_x_m.mean()), float(one.cell_y_m.mean()))
+    if not math.isfinite(direction):
+        return False
+    cos, sin = math.cos(direction), math.sin(direction)
+    if np.ptp(y * cos - x * sin) < _SYMBOL_ACROSS_M:
+        return False
+    half = CELL_M / 2
+    shape = shapely.union_all(shapely.box(x - half, y - half, x + half, y + half))
+    return symbol_of(shapely.transform(shape, lambda xy: xy @ np.array([[cos, -sin], [sin, cos]]))) != UNKNOWN
 
 
 def judged(scene: Scene, found: Contrast, components: Sequence[Component]) -> list[Component]:

@@ -367,6 +367,29 @@ class StopBar(Strict):
     """Share of its paint that is worn off, in flakes of 3 cm."""
 
 
+class Symbol(Strict):
+    """A symbol painted on a lane."""
+
+    station_m: float
+    """Station of its middle (m)."""
+    offset_m: float
+    """Offset of its middle (m)."""
+    shape: Literal["ahead", "left", "right", "ahead_left", "ahead_right", "bicycle", "triangle", "diamond"] = "ahead"
+    """What it shows: an arrow by the ways that it allows, a bicycle, or the rim of a triangle or a diamond."""
+    facing: Literal["forward", "backward"] = "forward"
+    """Who reads it: those who drive with stations, or against them."""
+    length_m: float = Field(default=4.0, gt=0.5, le=10.0)
+    """Extent along the road (m)."""
+    width_m: float = Field(default=0.9, gt=0.3, le=3.5)
+    """Extent across the road (m)."""
+    line_m: float = Field(default=0.15, gt=0.05, le=0.5)
+    """Width of an arrow's shaft (m)."""
+    head_m: float = Field(default=1.0, gt=0.1, le=4.0)
+    """Length of an arrow's head (m)."""
+    worn: float = Field(default=0.0, ge=0.0, le=1.0)
+    """Share of its paint that is worn off, in flakes of 3 cm."""
+
+
 class Crosswalk(Strict):
     """A zebra crossing: stripes along the road, side by side."""
 
@@ -530,6 +553,8 @@ class Road(Strict):
     """Stop bars."""
     crosswalks: list[Crosswalk] = []
     """Zebra crossings."""
+    symbols: list[Symbol] = []
+    """Arrows and other symbols."""
     targets: list[Target] = []
     """Painted control targets; with the plates of the roadside they are the survey's control points where there are
     any."""

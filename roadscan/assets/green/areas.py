@@ -110,10 +110,10 @@ def _midway(index: Float64, told: Bool) -> Float64:
     is_green = told & (index >= _GREEN)
     means, weights = [], []
     for side in (is_green, told & ~is_green):
-        own = side.astype(np.float32)
+        own = side.astype(np.float64)
         count = cv2.blur(own, (_AROUND, _AROUND))
         means.append(
-            cv2.blur(np.where(side, index, 0.0).astype(np.float32), (_AROUND, _AROUND)) / np.maximum(count, 1e-6)
+            cv2.blur(np.where(side, index, 0.0).astype(np.float64), (_AROUND, _AROUND)) / np.maximum(count, 1e-6)
         )
         weights.append(count)
     both = (weights[0] > 0.1) & (weights[1] > 0.1)
@@ -141,8 +141,8 @@ def _sigma_m(sums: Sums, raster: Callable[[Any], Any], pixel_m: Float64, told: B
         edge |= cv2.morphologyEx((is_green & both).view(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8))
     differ = both & (halves[0][0] != halves[1][0])
     box = (2 * _AROUND + 1, 2 * _AROUND + 1)
-    length = cv2.blur(edge.astype(np.float32), box)
-    between = cv2.blur(differ.astype(np.float32), box) / np.maximum(length / 3.0, 1e-6) * FINE_M
+    length = cv2.blur(edge.astype(np.float64), box)
+    between = cv2.blur(differ.astype(np.float64), box) / np.maximum(length / 3.0, 1e-6) * FINE_M
     between = np.where(length > 0.0, np.minimum(between, 0.5), 0.0)
     return np.asarray(np.sqrt((_OFF_PX * pixel_m) ** 2 + (0.5 * between) ** 2 + FINE_M**2 / 12.0))
 

@@ -103,6 +103,9 @@ class AssetKind(ABC):
     """What lies farther from a square than this (m) does not change the kind's evidence in it: 8 m holds a vehicle, a
     crown, a crosswalk, a fence's least length, and the surface behind a kerb with its slope."""
 
+    sees_green: ClassVar[bool] = False
+    """Whether it uses the green ground of pictures (:meth:`with_green`)."""
+
     @abstractmethod
     def evidence(self, scene: Scene, options: Any) -> Evidence:
         """Returns pieces of this kind in the scene's tile, a pure function of the scene."""
@@ -115,6 +118,10 @@ class AssetKind(ABC):
 
         `pieces` come in the order of tiles (row, column); `others` holds the objects of the kinds named by `after`.
         """
+
+    def with_green(self, pieces: pa.Table, green: pa.Table) -> pa.Table:
+        """Returns pieces with what the green cells of pictures (`roadscan.assets.green.areas.GREEN_CELLS`) say."""
+        return pieces
 
 
 @functools.cache

@@ -52,7 +52,8 @@ class Assets(Stage):
     )  # fmt: skip
     writes = (
         "intensity_samples", "intensity_gains", "scene_statistics", "asset_evidence", "asset_screens",
-        "asset_visibility", "asset_objects", "classified_points", "bare_earth", "ground_sections", AssetKind,
+        "asset_ground", "asset_green", "asset_visibility", "asset_objects",
+        "classified_points", "bare_earth", "ground_sections", AssetKind,
     )  # fmt: skip
 
     def run(self, session: Session) -> None:
@@ -70,6 +71,7 @@ class Assets(Stage):
             work = plan_evidence(session)
         if work.plan is not None:
             self._search(session, work, work.plan)
+            self._look_at_ground(session, work.plan)
             self._join(session, work.plan)
             self._write(session, work.plan, self._look(session, work.plan))
 
@@ -100,6 +102,19 @@ class Assets(Stage):
             session.compute, session.bar("squares searched for assets"),
         )  # fmt: skip
         session.failed(self.name, failures)
+
+    def _look_at_ground(self, session: Session, plan: AssetPlan) -> None:
+        """Find green ground in the pictures, where there are any."""
+        from roadscan.assets.tasks.green import find_green, green_tasks, plan_green
+        from roadscan.condition.tasks.tasks import run_units
+
+        manifest = session.manifest
+        green = plan_green(plan, manifest)
+        manifest.remove(green.gone(manifest))
+        tasks = green_tasks(plan, green, manifest, session.compute.workers)
+        if tasks:
+            bar = session.bar("squares whose ground is sought in pictures")
+            session.failed(self.name, run_units(find_green, tasks, manifest, session.compute, bar))
 
     def _join(self, session: Session, plan: AssetPlan) -> None:
         """Join pieces kind after kind, each after those that it uses."""
@@ -207,6 +222,7 @@ class Assets(Stage):
             return StageState()
         from roadscan.assets.tasks.evidence import EVIDENCE, evidence_tasks, memory_of
         from roadscan.assets.tasks.gains import current_gains
+        from roadscan.assets.tasks.green import plan_green
         from roadscan.assets.tasks.objects import OBJECTS
         from roadscan.assets.tasks.tables import TABLES
         from roadscan.assets.tasks.work import due_joins, plan_evidence
@@ -218,7 +234,8 @@ class Assets(Stage):
         made = manifest.files()
         stale = work.evidence_due
         if not stale:
-            stale = len(due_joins(plan, manifest)) or self._files_due(session, plan)
+            stale = len(plan_green(plan, manifest).due(manifest)) + len(due_joins(plan, manifest))
+            stale = stale or self._files_due(session, plan)
         current = sum(made.get(name, 0) for name in (EVIDENCE, OBJECTS, TABLES))
         tasks = evidence_tasks(plan, work.squares, current_gains(work.gains, manifest), session.compute.workers)
         state = StageState(current, stale)
@@ -253,6 +270,7 @@ class Assets(Stage):
         return (
             "tables/intensity_samples", "tables/intensity_gains", "tables/scene_statistics", "tables/asset_evidence",
             "tables/asset_objects",
-            "tables/asset_screens", "tables/asset_visibility", "tables/asset_pictures", ASSET_FOLDER, PICTURE_FOLDER,
+            "tables/asset_screens", "tables/asset_ground", "tables/asset_green", "tables/asset_visibility",
+            "tables/asset_pictures", ASSET_FOLDER, PICTURE_FOLDER,
             "products/classified_points", "products/ground_sections", "products/bare_earth",
         )  # fmt: skip

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -12,6 +12,7 @@ from pydantic import Field
 
 from roadscan.assets import classes
 from roadscan.assets.bins import cells_of, in_bins
+from roadscan.assets.green.colours import FINE, FINE_M
 from roadscan.assets.kernels.low_returns import low_moments
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence
 from roadscan.assets.scene import Scene
@@ -35,6 +36,7 @@ _WIDE: Final = np.ones((7, 7), np.uint8)
 """Walls, rails, kerbs and fences, with a cell to each side, are narrower than this (cells)."""
 _MARGIN_M: Final = 15.0
 """Cells are judged so far beyond a tile (m): openings and pools reach three metres."""
+_LARGEST_HOLE_M2: Final = 0.5  # Smaller holes in green ground are dry patches (m²).
 _POOLED: Final = np.ones((3, 3), np.uint8)
 """A cell is judged with those around it, which widens areas by one."""
 PIECE_SCHEMA: Final = pa.schema(
@@ -173,6 +175,10 @@ def _table(scene: Scene, chosen: Bool, ratio: Float64, corner: Float64) -> pa.Ta
     )  # fmt: skip
 
 
+WHOLE: Final = (1 << FINE * FINE) - 1
+"""The mask of a cell that belongs to its area as a whole."""
+
+
 def components(column: Int64, row: Int64) -> list[Int64]:
     """Returns numbers of the cells of each area: cells that share a side; areas by their first cell (row, column)."""
     if column.size == 0:
@@ -197,18 +203,75 @@ def area_of(column: Int64, row: Int64, cell_m: float = CELL_M) -> shapely.Geomet
     return shapely.union_all(runs, grid_size=1e-3)
 
 
+class Outline(NamedTuple):
+    """The shape of an area on the map (m), by how much it may be simplified, and 1 σ of its edge (m)."""
+
+    shape: shapely.Geometry
+    simple_m: float
+    sigma_m: float
+
+
+def outline_of(pieces: pa.Table, cells: Int64) -> Outline:
+    """Returns the outline of some cells; parts of cells are known of those that pictures show."""
+    column, row = (np.asarray(pieces[name])[cells] for name in ("column", "row"))
+    if "mask" not in pieces.column_names:
+        return Outline(area_of(column, row), 1.04 * CELL_M, CELL_M)
+    mask, sigma = (np.asarray(pieces[name])[cells] for name in ("mask", "sigma_m"))
+    if (mask == WHOLE).all() and (sigma == CELL_M).all():
+        return Outline(area_of(column, row), 1.04 * CELL_M, CELL_M)
+    bit = np.arange(FINE * FINE)
+    held, part = np.nonzero((mask[:, None] >> bit) & 1)
+    fine = column[held] * FINE + part % FINE, row[held] * FINE + part // FINE
+    number = row * (1 << 32) + column
+    around = [np.isin(number + step, number) for step in (1, -1, 1 << 32, -(1 << 32))]
+    edge = ~np.all(around, axis=0) | (mask != WHOLE)
+    return Outline(
+        without_small_holes(area_of(*fine, cell_m=FINE_M)),
+        1.04 * FINE_M,
+        float(np.sqrt(np.mean(np.square(sigma[edge if edge.any() else ~edge])))),
+    )
+
+
+def without_small_holes(shape: shapely.Geometry) -> shapely.Geometry:
+    """Returns an area without holes that are as small as a dry patch."""
+    parts = [
+        shapely.Polygon(one.exterior, [r for r in one.interiors if shapely.Polygon(r).area > _LARGEST_HOLE_M2])
+        for one in getattr(shape, "geoms", [shape])
+    ]
+    return parts[0] if len(parts) == 1 else shapely.MultiPolygon(parts)
+
+
+def cells_with_green(pieces: pa.Table, green: pa.Table) -> pa.Table:
+    """Returns cells of landscape areas with `mask` and `sigma_m`, by row and column: those that are grown over, whole
+    unless pictures show green ground beside them, and those that are green.
+    """
+    number, other = (t["row"].to_numpy() * (1 << 32) + t["column"].to_numpy() for t in (pieces, green))
+    shown = np.isin(number, other)
+    own = pieces.filter(pa.array(~shown))
+    own = own.append_column("mask", pa.array(np.full(own.num_rows, WHOLE, np.int32)))
+    own = own.append_column("sigma_m", pa.array(np.full(own.num_rows, CELL_M)))
+    planted = green.filter(pa.array(green["mask"].to_numpy() != 0))
+    both = pa.concat_tables([own, planted.select(own.column_names)])
+    return both.sort_by([("row", "ascending"), ("column", "ascending")])
+
+
 class LandscapeArea(AssetKind):
-    """Areas of cells that are grown over; one may lie within a sidewalk's."""
+    """Areas of cells that are grown over, or green in pictures; one may lie within a sidewalk's."""
 
     name = "landscape_area"
     title = "Landscape Areas"
     curve = "areas"
     options = LandscapeOptions
     piece_schema = PIECE_SCHEMA
+    sees_green = True
 
     def evidence(self, scene: Scene, options: LandscapeOptions) -> Evidence:
         """Returns cells of the tile."""
         return Evidence(grown_cells(scene, options))
+
+    def with_green(self, pieces: pa.Table, green: pa.Table) -> pa.Table:
+        """Returns cells that are grown over or green, with the parts of each that belong to the area, and σ."""
+        return cells_with_green(pieces, green)
 
     def objects(
         self, pieces: pa.Table, options: LandscapeOptions, others: Mapping[str, Sequence[AssetObject]]
@@ -218,13 +281,14 @@ class LandscapeArea(AssetKind):
         first, last = np.asarray(pieces["first_epoch_gps_ns"]), np.asarray(pieces["last_epoch_gps_ns"])
         passes = pieces["passes"].to_pylist()
         for cells in components(columns["column"], columns["row"]):
-            whole = area_of(columns["column"][cells], columns["row"][cells])
+            outline = outline_of(pieces, cells)
             height = float(np.mean(columns["height_m"][cells]))
-            for polygon in getattr(whole, "geoms", [whole]):
+            shown = cells[columns["returns"][cells] > 0]
+            for polygon in getattr(outline.shape, "geoms", [outline.shape]) if shown.size else ():
                 if polygon.area >= options.least_area_m2:
                     yield AssetObject(
-                        shapely.force_3d(polygon.simplify(1.04 * CELL_M), height), CELL_M, 0.05,
+                        shapely.force_3d(polygon.simplify(outline.simple_m), height), outline.sigma_m, 0.05,
                         float(np.mean(columns["probability"][cells])), int(columns["returns"][cells].sum()),
-                        len({p for i in cells.tolist() for p in passes[i]}), int(first[cells].min()),
-                        int(last[cells].max()), {"area_m2": float(polygon.area)},
+                        len({p for i in cells.tolist() for p in passes[i]}), int(first[shown].min()),
+                        int(last[shown].max()), {"area_m2": float(polygon.area)},
                     )  # fmt: skip

@@ -15,6 +15,7 @@ from pydantic import Field
 from roadscan.assets.edges.along_drive import EDGE_COLUMNS, FARTHEST_M, road_edges
 from roadscan.assets.edges.line_pieces import Line, joined_lines, line_schema, pieces_table
 from roadscan.assets.edges.steps import raster_of
+from roadscan.assets.green.edges import moved_to_green
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence
 from roadscan.assets.scene import Scene
 from roadscan.core.strict import Strict
@@ -41,6 +42,12 @@ class RoadEdge(AssetKind):
     def evidence(self, scene: Scene, options: Any) -> Evidence:
         """Returns edges beside the drives within the scene's tile."""
         return Evidence(pieces_table(road_edges(scene), scene, raster_of(scene), self.piece_schema))
+
+    sees_green: ClassVar[bool] = True
+
+    def with_green(self, pieces: pa.Table, green: pa.Table) -> pa.Table:
+        """Returns pieces whose verges begin where pictures show it."""
+        return moved_to_green(pieces, green)
 
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from roadscan.assets.edges.along_drive import BESIDE_PIECES, pieces_beside
 from roadscan.assets.edges.line_pieces import Strip, joined_lines, polygon_of, running_slope, sigma_width_m, strips_of
+from roadscan.assets.green.edges import ended_at_green
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence
 from roadscan.assets.kinds.kerb import types_along
 from roadscan.assets.scene import Scene
@@ -42,6 +43,12 @@ class Sidewalk(AssetKind):
     def evidence(self, scene: Scene, options: Any) -> Evidence:
         """Returns the scene's edges within its tile, and at each node the surface behind it."""
         return Evidence(pieces_beside(scene))
+
+    sees_green: ClassVar[bool] = True
+
+    def with_green(self, pieces: pa.Table, green: pa.Table) -> pa.Table:
+        """Returns pieces whose surfaces end where pictures show green ground."""
+        return ended_at_green(pieces, green)
 
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]

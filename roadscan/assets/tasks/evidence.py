@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.assets.files.squares import classified_points, write_bare_earth, write_classified
+from roadscan.assets.green.cells import ground_cells
 from roadscan.assets.ground.bare_earth import within
 from roadscan.assets.intensity import calibrated_scene
 from roadscan.assets.kind import AssetKind, Evidence, Marked, asset_kinds
@@ -43,6 +44,8 @@ CLASSIFIED: Final = "classified_points"
 BARE_EARTH: Final = "bare_earth"
 SCREENS: Final = "asset_screens"
 """Manifest name of the occluders of views."""
+GROUND: Final = "asset_ground"
+"""Manifest name of the cells of the ground that pictures may show."""
 VISIBILITY: Final = "asset_visibility"
 """Cells of a square, and how many passes had them in sight."""
 
@@ -107,7 +110,7 @@ def due_squares(
         if plan.config.bare_earth:
             beside[BARE_EARTH] = key_of(code, key, plan.context.survey_id)
         if plan.wants_pictures:
-            beside[SCREENS] = key_of(code, key, SCREENS)
+            beside |= {name: key_of(code, key, name) for name in (SCREENS, GROUND)}
         if square not in anew:
             keys = {n: k for n, k in keys.items() if not manifest.is_current(EVIDENCE, evidence_unit(n, square), k)}
             beside = {name: k for name, k in beside.items() if not manifest.is_current(name, unit, k)}
@@ -228,7 +231,10 @@ class _Search:
                 marked += found.marked
             except Exception as error:  # noqa: BLE001  one kind's fault must not stop the others
                 self.failures.append((evidence_unit(name, self._work.square), reason_of(error)))
-        writers = {BARE_EARTH: self._write_bare_earth, SCREENS: self._write_screens, VISIBILITY: self._write_visibility}
+        writers = {
+            BARE_EARTH: self._write_bare_earth, SCREENS: self._write_screens, GROUND: self._write_ground,
+            VISIBILITY: self._write_visibility,
+        }  # fmt: skip
         for product, write in writers.items():
             if product in self._work.beside:
                 yield write(scene, self._work.beside[product])
@@ -272,6 +278,9 @@ class _Search:
 
     def _write_screens(self, scene: Scene, key: str) -> OutputRecord:
         return self._write_rows(SCREENS, str(self._work.square), key, screens_of(scene))
+
+    def _write_ground(self, scene: Scene, key: str) -> OutputRecord:
+        return self._write_rows(GROUND, str(self._work.square), key, ground_cells(scene))
 
     def _write_visibility(self, scene: Scene, key: str) -> OutputRecord:
         unit, schema = str(self._work.square), table_schema(VISIBILITY)

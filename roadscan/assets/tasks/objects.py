@@ -26,6 +26,8 @@ from roadscan.store.store import Store
 from roadscan.tiles.tasks.tiles import TaskResult
 
 OBJECTS: Final = "asset_objects"
+GREEN: Final = "asset_green"
+"""Manifest name of the planted cells of a square that pictures tell."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,8 @@ class JoinTask:
     others: tuple[tuple[str, tuple[OutputRecord, ...]], ...]
     """Objects of other kinds near it, which this one uses."""
     key: str
+    green: tuple[OutputRecord, ...] = ()
+    """Green ground of its squares in pictures, for kinds that use it."""
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -97,7 +101,8 @@ def plan_joins(
         for r in manifest.of(EVIDENCE).values()
         if r.path and r.unit.startswith(f"{wanted.name}/")
     }
-    own = clusters[wanted.name] = [Cluster(wanted.name, squares) for squares in clustered(held)]
+    green = {TileId.parse(u): r for u, r in manifest.of(GREEN).items() if r.path and wanted.kind.sees_green}
+    own = clusters[wanted.name] = [Cluster(wanted.name, squares) for squares in clustered({**held, **green})]
     objects, code = manifest.of(OBJECTS), wanted.objects_key()
     tasks = []
     for cluster in own:
@@ -110,10 +115,12 @@ def plan_joins(
             for name in wanted.kind.after
             if name in clusters
         )
-        pieces = tuple(held[square] for square in cluster.squares)
+        pieces = tuple(held[square] for square in cluster.squares if square in held)
+        seen = tuple(green[square] for square in cluster.squares if square in green)
         read = [[name, [(r.unit, r.digest) for r in records]] for name, records in others]
-        key = key_of(code, grid.edge_m, [(r.unit, r.digest) for r in pieces], read)
-        tasks.append(JoinTask(store, grid, cluster, wanted.options, pieces, others, key))
+        shown = [[(r.unit, r.digest) for r in seen]] if seen else []
+        key = key_of(code, grid.edge_m, [(r.unit, r.digest) for r in pieces], read, *shown)
+        tasks.append(JoinTask(store, grid, cluster, wanted.options, pieces, others, key, seen))
     units = {cluster.unit for cluster in own}
     gone = tuple(r for u, r in objects.items() if u.startswith(f"{wanted.name}/") and u not in units)
     return JoinPlan(tuple(tasks), gone)
@@ -157,6 +164,8 @@ def _joined(task: JoinTask) -> OutputRecord:
     name = task.cluster.kind
     kind, schema = asset_kinds()[name], asset_schema(name).arrow()
     pieces = pa.concat_tables([kind.piece_schema.empty_table(), *(_read(task.store, r) for r in task.pieces)])
+    if task.green:
+        pieces = kind.with_green(pieces, pa.concat_tables([_read(task.store, r) for r in task.green]))
     near = task.cluster.near()
     others = {other: _near(task, records, near) for other, records in task.others}
     curve = curve_named(kind.curve)

@@ -19,7 +19,7 @@ from roadscan.assets.pictures.reader import ColourReader, CutOut, CutOutReader, 
 from roadscan.assets.tasks.picture_work import CUT_OUTS, SEEN, PictureTask, SquareObjects, around, rows_by_square
 from roadscan.assets.tasks.recognition import recognition_of
 from roadscan.assets.visibility import EDGE_M, SCREENS
-from roadscan.compute.array_types import Bool, Float64
+from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.extras import cv2
 from roadscan.core.grid import Bounds
 from roadscan.pictures.colours import ColourSource, world_places
@@ -58,8 +58,21 @@ def best_sights(looks: Sequence[Sight], pictures: Pictures, screens: pa.Table) -
 
 def _hidden(found: Sights, places_m: Float64, pictures: Pictures, screens: pa.Table) -> Bool:
     """Returns a mask (n,) of the sights that are obstructed."""
-    hidden = np.zeros(len(found), np.bool_)
-    if not (len(found) and screens.num_rows):
+    eyes = _eyes_m(pictures)[found.view]
+    return _lines_hidden(eyes, places_m[found.item], pictures.epochs_gps_ns[found.view], screens)
+
+
+def hidden_cells(pictures: Pictures, number: int, places_m: Float64, screens: pa.Table) -> Bool:
+    """Returns a mask (n,) of the places (n, 3) that something hides from one picture."""
+    one = pictures.chosen(np.array([number]))
+    every = np.zeros(len(places_m), np.int64)
+    return _lines_hidden(_eyes_m(one)[every], places_m, one.epochs_gps_ns[every], screens)
+
+
+def _lines_hidden(eyes_m: Float64, places_m: Float64, epochs_gps_ns: Int64, screens: pa.Table) -> Bool:
+    """Returns a mask (n,) of the lines from cameras to places (n, 3) that voxels obstruct."""
+    hidden = np.zeros(len(places_m), np.bool_)
+    if not (len(places_m) and screens.num_rows):
         return hidden
     voxel = np.column_stack([screens[name].to_numpy() for name in ("column", "row", "level")]).astype(np.int64)
     low = voxel.min(axis=0)
@@ -67,10 +80,10 @@ def _hidden(found: Sights, places_m: Float64, pictures: Pictures, screens: pa.Ta
     key = ((voxel[:, 0] - low[0]) * shape[1] + voxel[:, 1] - low[1]) * shape[2] + voxel[:, 2] - low[2]
     order = np.argsort(key, kind="stable")
     spans = np.column_stack([screens[name].to_numpy() for name in ("first_epoch_gps_ns", "last_epoch_gps_ns")])
-    eyes, corner = _eyes_m(pictures), low * EDGE_M
+    corner = low * EDGE_M
     find_hidden(
-        np.ascontiguousarray(eyes[found.view] - corner), np.ascontiguousarray(places_m[found.item] - corner),
-        pictures.epochs_gps_ns[found.view], key[order], np.ascontiguousarray(spans[order]), shape, EDGE_M, _WALKED_M,
+        np.ascontiguousarray(eyes_m - corner), np.ascontiguousarray(places_m - corner), epochs_gps_ns, key[order],
+        np.ascontiguousarray(spans[order]), shape, EDGE_M, _WALKED_M,
         hidden,
     )  # fmt: skip
     return hidden

@@ -340,7 +340,7 @@ class Marking(Strict):
     """Length of a dash (m); 0: a solid line."""
     gap_m: float = Field(default=0.0, ge=0.0)
     """Length of the gap between dashes (m)."""
-    colour: Literal["white", "yellow"] = "white"
+    colour: Literal["white", "yellow", "green"] = "white"
     """Colour."""
     worn: float = Field(default=0.0, ge=0.0, le=1.0)
     """Share of its paint that is worn off, in flakes of 3 cm."""
@@ -479,7 +479,7 @@ class Brightness(Strict):
 
 
 class Grass(Strict):
-    """Grass on the verge: each beam is stopped somewhere among the blades, or by the soil."""
+    """Grass on the verge: each beam is stopped somewhere among the blades, or by the soil. Green in pictures."""
 
     height_m: float = Field(default=0.05, gt=0.0, le=0.6)
     """Height of the blades: 0.03 mown, 0.3 rough (m)."""

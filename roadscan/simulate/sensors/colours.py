@@ -26,7 +26,11 @@ SIGN_COLOURS: Final = {
     "green": (0.04, 0.46, 0.24), "brown": (0.42, 0.24, 0.12), "orange": (0.96, 0.46, 0.06), "black": (0.07, 0.07, 0.07),
 }  # fmt: skip
 _LIGHT: Final = ("white", "yellow", "orange")
-_PAINT: Final = {"white": (1.0, 1.0, 1.0), "yellow": (1.0, 0.76, 0.20)}  # shares of red, green and blue
+_PAINT: Final = {
+    "white": (1.0, 1.0, 1.0),
+    "yellow": (1.0, 0.76, 0.20),
+    "green": (0.10, 0.58, 0.36),
+}  # shares of red, green and blue
 _PAINT_FROM: Final = 150.0
 """Least shade of paint on the road."""
 _KINDS: Final = {
@@ -35,6 +39,11 @@ _KINDS: Final = {
 }  # fmt: skip
 _CARS: Final = ((1.0, 1.0, 1.0), (0.95, 0.45, 0.40), (0.50, 0.62, 0.95), (0.85, 0.86, 0.90), (0.55, 0.60, 0.58))  # RGB
 _ASPHALT: Final = (1.0, 0.99, 0.97)  # shares of red, green and blue
+_GRASS: Final = ((0.76, 1.0, 0.50), (1.0, 0.96, 0.66))  # fresh and dry: shares of red, green and blue
+_DRY_M: Final = (1.7, 0.6)
+"""Wavelengths of what is dry in a lawn (m)."""
+_DRY_FROM: Final = 1.1
+"""Sum of the waves from which grass is rather dry than fresh: an eighth of a lawn."""
 _FACE_PX: Final = 256  # pixels of a face's edge
 _ON_FACE_M: Final = 0.01  # margin around a face or a marking
 _SHADE_WITHIN: Final = 1.0  # largest difference from a face's shade
@@ -74,6 +83,8 @@ class Tints:
             number: _face(sign, world.objects[number - 1].bodies[0]) for number, sign in described_signs(world.scene)
         }
         self._stripes = [m for m in world.scene.road.markings if m.colour != "white"]
+        grass = world.scene.road.grass
+        self._grass_m = np.inf if grass is None else world.scene.road.paved_m + grass.from_m
 
     def of(self, hits: Hits) -> Float32:
         """Return shares (n, 3) for the n rays of the first group; those of the sky for rays without a hit."""
@@ -83,6 +94,11 @@ class Tints:
             rows = np.flatnonzero(number == face_number)
             if rows.size:
                 out[rows] = _on_face(face, place[rows] - self._world.surface.origin_enh_m, hits.intensity[0][rows])
+        if np.isfinite(self._grass_m):
+            rows = np.flatnonzero(number == 0)
+            _, offset = self._world.surface.station_offset_m(place[rows, 0], place[rows, 1])
+            rows = rows[np.abs(offset) > self._grass_m]
+            out[rows] = _grass(place[rows])
         if self._stripes:
             rows = np.flatnonzero((number == 0) & (np.nan_to_num(hits.intensity[0]) >= _PAINT_FROM))
             if rows.size:
@@ -96,6 +112,19 @@ class Tints:
             near = np.abs(offset - one.offset_m) <= one.width_m / 2 + _ON_FACE_M
             tint[near & (station >= one.start_m) & (station <= one.end_m)] = _PAINT[one.colour]
         return tint
+
+
+def _grass(place_m: Float64) -> Float64:
+    """Return shares (n, 3) of a lawn at places (n, 3): fresh, and dry in patches."""
+    dry = np.zeros(len(place_m))
+    for number, wave in enumerate(_DRY_M):
+        turn = 0.7 + 1.9 * number
+        along = place_m[:, 0] * np.cos(turn) + place_m[:, 1] * np.sin(turn)
+        across = place_m[:, 1] * np.cos(turn) - place_m[:, 0] * np.sin(turn)
+        dry += np.sin(2 * np.pi * along / wave) * np.cos(2 * np.pi * across / (1.3 * wave))
+    share = np.clip(0.5 + 2.0 * (dry - _DRY_FROM), 0.0, 1.0)[:, None]
+    fresh, brown = np.array(_GRASS)
+    return np.asarray(fresh + share * (brown - fresh))
 
 
 def _face(sign: Sign, plate: Float64) -> _Face:

@@ -1,0 +1,74 @@
+"""Cells of the ground that pictures may show: heights, intensity, and what stands there."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+import pyarrow as pa
+import scipy.spatial
+
+from roadscan.assets import classes
+from roadscan.assets.bins import cells_of, in_bins
+from roadscan.assets.scene import Scene
+
+CELL_M: Final = 0.25
+"""Edge of a cell (m), as of landscape areas; corners are multiples of it in the map."""
+FARTHEST_M: Final = 12.0
+"""Cells farther from all drives (m) are not looked at: a pixel spans too much of the ground there."""
+_LOW_M: Final = (-0.3, 0.3)
+"""Heights above the ground of returns that tell the intensity of a cell (m)."""
+_STANDS_M: Final = (0.3, 2.5)
+"""What returns from these heights above the ground (m) hides the ground of its cell from a camera."""
+_STANDING: Final = 2  # So many returns stand in a cell.
+GROUND_CELLS: Final = pa.schema(
+    [
+        ("column", pa.int64()), ("row", pa.int64()), ("height_m", pa.float64()), ("intensity", pa.float32()),
+        ("returns", pa.int32()), ("drive_m", pa.float32()), ("stands", pa.bool_()),
+        ("passes", pa.list_(pa.int32())), ("first_epoch_gps_ns", pa.int64()), ("last_epoch_gps_ns", pa.int64()),
+    ]
+)  # fmt: skip
+"""A row a cell (easting // 0.25, northing // 0.25): height of bare earth at its middle, mean intensity of its low
+returns, distance of the nearest drive, and whether anything stands there."""
+
+
+def ground_cells(scene: Scene) -> pa.Table:
+    """Returns cells of the scene's tile whose ground is known, near a drive, by row and column."""
+    tile, returns = scene.tile, scene.returns
+    shape = round((tile.y_max_m - tile.y_min_m) / CELL_M), round((tile.x_max_m - tile.x_min_m) / CELL_M)
+    if not len(scene.drive_xyh_m) or not len(returns):
+        return GROUND_CELLS.empty_table()
+    row, column = (at.reshape(-1) for at in np.indices(shape))
+    x, y = tile.x_min_m + (column + 0.5) * CELL_M, tile.y_min_m + (row + 0.5) * CELL_M
+    away, _ = scipy.spatial.cKDTree(scene.drive_xyh_m[:, :2]).query(
+        np.column_stack([x, y]), distance_upper_bound=FARTHEST_M
+    )
+    height = scene.ground.height_at(x, y)
+    held = np.flatnonzero(np.isfinite(away) & np.isfinite(height))
+    number = np.full(row.size + 1, -1, np.int32)
+    number[held] = np.arange(held.size)
+    grid = (tile.x_min_m, tile.y_min_m, CELL_M)
+    above, codes = scene.above_ground_m, scene.classes
+    noise = np.isin(codes, (classes.LOW_NOISE, classes.HIGH_NOISE))
+    stands = np.flatnonzero((above >= _STANDS_M[0]) & (above <= _STANDS_M[1]) & ~noise)
+    standing, _ = in_bins(number[cells_of(returns.x_m[stands], returns.y_m[stands], grid, shape)], held.size)
+    low = np.flatnonzero((above >= _LOW_M[0]) & (above <= _LOW_M[1]) & ~noise)
+    starts, order = in_bins(number[cells_of(returns.x_m[low], returns.y_m[low], grid, shape)], held.size)
+    rows, count = low[order], np.diff(starts)
+    total = np.concatenate([[0.0], np.cumsum(returns.intensity[rows].astype(np.float64))])
+    epochs, passes = returns.epoch_gps_ns[rows], returns.pass_id[rows]
+    spans = list(zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True))
+    east, north = (round((returns.corner_m[k] + (tile.x_min_m, tile.y_min_m)[k]) / CELL_M) for k in (0, 1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        intensity = (total[starts[1:]] - total[starts[:-1]]) / count
+    return pa.table(
+        {
+            "column": east + column[held], "row": north + row[held], "height_m": height[held],
+            "intensity": intensity.astype(np.float32), "returns": count.astype(np.int32),
+            "drive_m": away[held].astype(np.float32), "stands": np.diff(standing) >= _STANDING,
+            "passes": pa.array([np.unique(passes[a:b]).tolist() for a, b in spans], pa.list_(pa.int32())),
+            "first_epoch_gps_ns": np.array([int(epochs[a:b].min()) if b > a else 0 for a, b in spans], np.int64),
+            "last_epoch_gps_ns": np.array([int(epochs[a:b].max()) if b > a else 0 for a, b in spans], np.int64),
+        },
+        GROUND_CELLS,
+    )  # fmt: skip

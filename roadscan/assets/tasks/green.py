@@ -1,0 +1,204 @@
+"""Green ground of squares, from all pictures that show it: the plan, and the work on workers."""
+
+from __future__ import annotations
+
+import functools
+import io
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from roadscan.assets.green.areas import MARGIN_CELLS, Mosaic, Sums, green_rows, mosaic_of
+from roadscan.assets.green.cells import CELL_M
+from roadscan.assets.green.colours import REACH_M, Ground, PlacedGround, ground_of, looked_at
+from roadscan.assets.settings import picture_rule
+from roadscan.assets.tasks.evidence import GROUND, SCREENS
+from roadscan.assets.tasks.objects import GREEN
+from roadscan.assets.tasks.pictures import hidden_cells
+from roadscan.assets.tasks.plan import AssetPlan
+from roadscan.assets.tiling import AssetGrid
+from roadscan.assets.visibility import SCREENS as SCREEN_ROWS
+from roadscan.core.errors import ConfigError, RunError
+from roadscan.core.grid import Bounds, TileId
+from roadscan.pictures.colours import ColourSource
+from roadscan.pictures.placed import Pictures, plan_pictures
+from roadscan.run.engine.compute import reason_of
+from roadscan.run.keys import code_digest, key_of
+from roadscan.store.digest import bytes_digest
+from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
+from roadscan.store.store import Store
+from roadscan.tiles.tasks.tiles import TaskResult
+
+_MARGIN_M: Final = MARGIN_CELLS * CELL_M
+_AROUND_M: Final = _MARGIN_M + 2.0 * REACH_M + 1.0
+"""Ground this far around a square (m) tells the light of the pictures that show it."""
+
+
+@dataclass(frozen=True)
+class GreenTask:
+    """Some squares whose ground is looked at in pictures. Sent to workers: it carries no picture."""
+
+    store: Store
+    grid: AssetGrid
+    work: tuple[tuple[TileId, str], ...]
+    """Squares, and their keys."""
+    ground: tuple[tuple[TileId, OutputRecord], ...]
+    """Cells of the ground in them and around them."""
+    screens: tuple[tuple[TileId, OutputRecord], ...]
+    pictures: Pictures
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Returns the names of its squares."""
+        return tuple(str(square) for square, _ in self.work)
+
+    def singly(self) -> list[GreenTask]:
+        """Returns a task for each square."""
+        return [replace(self, work=(one,)) for one in self.work]
+
+
+@dataclass(frozen=True)
+class GreenPlan:
+    """Squares whose ground pictures show."""
+
+    keys: Mapping[TileId, str] = field(default_factory=dict)
+    pictures: Pictures | None = None
+
+    def due(self, manifest: Manifest) -> list[TileId]:
+        """Returns those that are missing or stale."""
+        return [square for square, key in self.keys.items() if not manifest.is_current(GREEN, str(square), key)]
+
+    def gone(self, manifest: Manifest) -> list[OutputRecord]:
+        """Returns outputs of squares that no picture shows any more."""
+        return manifest.beside({GREEN}, {str(square) for square in self.keys})
+
+
+def plan_green(plan: AssetPlan, manifest: Manifest) -> GreenPlan:
+    """Returns the squares whose ground is to be looked at; none without pictures or a kind that asks for them."""
+    if not (plan.wants_pictures and any(one.kind.sees_green for one in plan.kinds)):
+        return GreenPlan()
+    try:
+        pictures = plan_pictures(plan.survey, replace(picture_rule(plan.config.pictures), reach_m=REACH_M))
+    except (ConfigError, RunError):  # the search for pictures of objects says why
+        return GreenPlan()
+    ground, screens = _held(manifest, GROUND), _held(manifest, SCREENS)
+    code = code_digest("roadscan.assets.tasks.green:find_green")
+    keys = {}
+    for square in ground:
+        near = pictures.near(_box(plan.grid, square))
+        if len(near):
+            read = [[r.digest for _, r in _around(plan.grid, square, some)] for some in (ground, screens)]
+            keys[square] = key_of(code, near.key(), read, plan.grid.edge_m)
+    return GreenPlan(keys, pictures)
+
+
+def green_tasks(plan: AssetPlan, green: GreenPlan, manifest: Manifest, workers: int = 1) -> list[GreenTask]:
+    """Returns tasks over neighbouring squares, which share pictures."""
+    if green.pictures is None:
+        return []
+    ground, screens, tasks = _held(manifest, GROUND), _held(manifest, SCREENS), []
+    for squares in plan.blocks(green.due(manifest), workers):
+        own = [{s: r for square in squares for s, r in _around(plan.grid, square, some)} for some in (ground, screens)]
+        near = green.pictures.near(*(_box(plan.grid, square) for square in squares))
+        tasks.append(
+            GreenTask(plan.survey.store, plan.grid, tuple((s, green.keys[s]) for s in squares),
+                      tuple(own[0].items()), tuple(own[1].items()), near)
+        )  # fmt: skip
+    return tasks
+
+
+def _held(manifest: Manifest, name: str) -> dict[TileId, OutputRecord]:
+    found = {TileId.parse(unit): record for unit, record in manifest.of(name).items() if record.path}
+    return dict(sorted(found.items(), key=lambda one: (one[0].row, one[0].column)))
+
+
+def _box(grid: AssetGrid, square: TileId, beyond_m: float = _MARGIN_M) -> Bounds:
+    own = grid.squares.bounds(square)
+    return Bounds(own.easting_min_m - beyond_m, own.northing_min_m - beyond_m, own.easting_max_m + beyond_m,
+                  own.northing_max_m + beyond_m)  # fmt: skip
+
+
+def _around(grid: AssetGrid, square: TileId, held: Mapping[TileId, OutputRecord]) -> list[tuple[TileId, OutputRecord]]:
+    """Returns what is held of a square and of those that its pictures may show."""
+    rings = math.ceil(_AROUND_M / grid.edge_m)
+    names = (TileId(square.column + c, square.row + r) for r in range(-rings, rings + 1)
+             for c in range(-rings, rings + 1))  # fmt: skip
+    return [(name, held[name]) for name in names if name in held]
+
+
+def find_green(task: GreenTask) -> TaskResult:
+    """Look at the ground of a task's squares, and write the planted cells (runs on a worker)."""
+    records: list[OutputRecord] = []
+    failures: list[tuple[str, str]] = []
+    source = ColourSource(task.pictures)
+    ground = {square: recorded_table(task.store, record) for square, record in task.ground}
+    screens = {square: recorded_table(task.store, record) for square, record in task.screens}
+    for square, key in task.work:
+        try:
+            records.append(_record(task, square, key, _found(task, square, ground, screens, source)))
+        except Exception as error:  # noqa: BLE001  one square's fault must not stop the others
+            failures.append((str(square), reason_of(error)))
+    return TaskResult.of(records, failures)
+
+
+def _found(
+    task: GreenTask,
+    square: TileId,
+    ground: Mapping[TileId, pa.Table],
+    screens: Mapping[TileId, pa.Table],
+    source: ColourSource,
+) -> tuple[pa.Table, dict[str, int]]:
+    """Returns rows of a square's planted cells, and how many pictures told of it and how many were not believed."""
+    held = dict(task.ground)
+    rows = pa.concat_tables([ground[name] for name, _ in _around(task.grid, square, held)])
+    cells, rows = ground_of(rows, _box(task.grid, square, _AROUND_M))
+    hides = [screens[name] for name, _ in _around(task.grid, square, dict(task.screens))]
+    near = task.pictures.near(_box(task.grid, square))
+    sums, told, doubted = Sums(len(cells.column)), 0, 0
+    placed = PlacedGround.of(cells, near)
+    voxels = pa.concat_tables([SCREEN_ROWS.empty_table(), *hides])
+    for number in range(len(near)):
+        picture = source.picture(near, number)
+        if picture is None:
+            continue
+        hidden = functools.partial(hidden_cells, near, number, screens=voxels)
+        look = looked_at(picture, near, number, placed, hidden)
+        if look is None:
+            doubted += 1
+            continue
+        sums.add(look, int(bytes_digest(near.name(number).encode())[-1], 16) & 1)
+        told += 1
+    mosaic, first = _window(task.grid, square, cells, sums)
+    own = _box(task.grid, square, 0.0)
+    table = green_rows(
+        mosaic, first, rows, (own.easting_min_m, own.northing_min_m, own.easting_max_m, own.northing_max_m)
+    )
+    return table, {"pictures": told, "doubted": doubted}
+
+
+def _window(grid: AssetGrid, square: TileId, cells: Ground, sums: Sums) -> tuple[Mosaic, tuple[int, int]]:
+    """Returns the mosaic of a square with its margin, and the row and column of its first cell."""
+    box = _box(grid, square)
+    first = round(box.northing_min_m / CELL_M), round(box.easting_min_m / CELL_M)
+    shape = round(box.northing_max_m / CELL_M) - first[0], round(box.easting_max_m / CELL_M) - first[1]
+    row, column = cells.row - first[0], cells.column - first[1]
+    inside = np.flatnonzero((row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1]))
+    return mosaic_of(sums, inside, (row[inside], column[inside]), shape, cells.drive_m[inside]), first
+
+
+def _record(task: GreenTask, square: TileId, key: str, found: tuple[pa.Table, dict[str, int]]) -> OutputRecord:
+    rows, counts = found
+    detail = json.dumps({"cells": rows.num_rows, **counts})
+    if not rows.num_rows:
+        return OutputRecord(GREEN, str(square), key, "", 0, "", detail)
+    stream = io.BytesIO()
+    pq.write_table(rows, stream, compression="zstd", write_page_checksum=True, version="2.6")
+    content, target = stream.getvalue(), f"tables/{GREEN}/{square}.parquet"
+    task.store.write_bytes(target, content, lasting=False)
+    return OutputRecord(GREEN, str(square), key, target, len(content), bytes_digest(content), detail)

@@ -8,7 +8,7 @@ import pytest
 from benchmarks.judged_scenes import simulated
 from benchmarks.labelled_returns import labelled_returns
 from roadscan.assets.classes import OVERHEAD_STRUCTURE
-from roadscan.assets.upright.standing import _reach
+from roadscan.assets.upright.attached import _reach
 from roadscan.simulate import Scene
 from tests.assets.upright.scene import objects_of
 

@@ -33,7 +33,7 @@ LONG_ARMS: Final = (541, 546, 547, 548, 550, 551, 552, 557)
 LONG_ARM_M: Final = 5.5
 """Seeds of streets whose lamps may have arms as long as those of signals, and how long (m)."""
 _HEAD_M: Final = 0.3
-"""A signal of which no box so high is seen (m), at its shaft or within reach at its arm, is one that nobody can tell."""
+"""A signal of which no box so high is seen (m), at its shaft or within reach at its arm, nobody can tell."""
 _RECORDED_WEIGHT: Final = 0.15
 """How much a shaft of the recording counts: 18 views show the same street."""
 BRIGHT: Final = ("bright", "head_bright", "end_bright")

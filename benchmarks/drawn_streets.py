@@ -176,6 +176,57 @@ def street_of_lookalikes(seed: int) -> Scene:
     return street.changed(id=f"lookalikes-{seed}", roadside=held, road=road)
 
 
+def street_of_shafts(seed: int, *, lamp_arm_m: float = 3.0) -> Scene:
+    """A drawn street with posts, lamps, signals and trees, before fronts and balconies too, at 25 to 95 km/h.
+
+    lamp_arm_m : arms of lamps are no longer.
+    """
+    random = np.random.default_rng([seed, 53])
+    street = drawn_street(seed)
+    near = street.road.paved_m
+
+    def between(low: float, high: float) -> float:
+        return float(random.uniform(low, high))
+
+    held = street.roadside.model_dump() | {"trees": [], "lamp_posts": [], "signals": []}
+    for station in np.arange(1.0, LENGTH_M, 3.2):
+        for side in (-1.0, 1.0):
+            what = str(random.choice(["trees", "trees", "lamp_posts", "signals", "poles", "none"]))
+            place = {"station_m": float(station) + between(-0.8, 0.8), "offset_m": side * (near + between(0.4, 2.5))}
+            if what == "trees":
+                height = between(3.5, 13.0)
+                held[what].append(place | {
+                    "offset_m": side * (near + between(0.8, 8.0)), "height_m": height, "trunk_m": between(0.1, 0.5),
+                    "crown_m": min(between(1.5, 6.0), 0.8 * height), "density": between(0.3, 0.9),
+                    "lean_deg": between(0.0, 8.0), "crown_from_m": between(1.2, 0.6 * height),
+                })  # fmt: skip
+            elif what == "lamp_posts":
+                held[what].append(place | {
+                    "height_m": between(4.0, 9.0), "diameter_m": between(0.08, 0.24), "arm_m": between(0.5, lamp_arm_m),
+                    "is_double": bool(random.random() < 0.3),
+                })  # fmt: skip
+            elif what == "signals":
+                arm = between(1.5, 6.0) if random.random() < 0.4 else 0.0
+                held[what].append(place | {
+                    "height_m": between(4.8, 7.0) if arm else between(2.7, 3.8), "arm_m": arm,
+                    "diameter_m": between(0.08, 0.2), "faces": str(random.choice(["forward", "backward"])),
+                })  # fmt: skip
+            elif what == "poles":
+                held[what].append(place | {"height_m": between(0.7, 9.0), "diameter_m": between(0.05, 0.35)})
+    for front in held["facades"]:
+        side, away = float(np.sign(front["offset_m"])), abs(front["offset_m"])
+        for station in np.arange(2.0, LENGTH_M, 6.0):
+            at = float(station) + between(-1.0, 1.0)
+            held["furniture"].append({"what": "balcony", "station_m": at, "offset_m": side * (away - 0.6),
+                                      "scale": between(0.7, 1.4), "shade": between(50, 170)})  # fmt: skip
+            held["poles"].append({"station_m": at + between(-0.8, 0.8), "offset_m": side * (away - between(0.5, 1.6)),
+                                  "height_m": between(2.4, 4.5), "diameter_m": between(0.05, 0.2)})  # fmt: skip
+    lidar = street.lidar.model_dump() | {"model": str(random.choice(["HDL-32E", "HDL-32E", "VLP-16", "VLP-16"]))}
+    speed = between(7.0, 14.0) if random.random() < 0.6 else between(16.0, 26.0)
+    vehicle = street.vehicle.model_dump() | {"speed_m_per_s": speed}
+    return street.changed(id=f"shafts-{seed}", roadside=held, lidar=lidar, vehicle=vehicle, bag={"on": True})
+
+
 SYMBOLS: Final = ("ahead", "left", "right", "ahead_left", "ahead_right", "triangle", "diamond", "bicycle")
 
 

@@ -6,18 +6,21 @@ survey has them. Simulated streets are hard ones of all kinds, motorways among t
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+import pandas as pd
 
+from benchmarks.asset_streets import LOW_POST_M
 from benchmarks.drawn_streets import drawn_street
 from benchmarks.hard_streets import hard_street
 from benchmarks.labelled_returns import CLASSES, LabelledReturns, labelled_returns
 from benchmarks.labelled_street import labelled_sweeps, laid_out, recording_folder
+from benchmarks.street_classes import SHAFT_OF_KIND, SHAFTS
 from benchmarks.street_scores import CAR, NOT_JUDGED, VEGETATION
 from benchmarks.street_scores import POLE as POLE_LABEL
 from benchmarks.street_scores import SIGN as SIGN_LABEL
@@ -62,6 +65,8 @@ class JudgedScene:
     scene: Scene
     what: UInt8
     """(n,) as numbered above."""
+    types: UInt8
+    """(n,) what type of shaft, an index of :data:`benchmarks.street_classes.SHAFTS`; that of the object met."""
     name: str
     source: str
     """"recorded", "hard" or "plain"."""
@@ -76,15 +81,25 @@ class JudgedScene:
 
 def judged_scenes(folder: Path) -> Iterator[JudgedScene]:
     """Yield all scenes that judges are fitted to."""
+    yield from recorded_scenes(folder)
+    yield from simulated_scenes(HARD, PLAIN)
+
+
+def recorded_scenes(folder: Path) -> Iterator[JudgedScene]:
+    """Yield the scenes of the recorded street."""
     laid_out(recording_folder(), folder / "sweeps-0-3", range(4))
     sweeps = _sweeps(folder / "sweeps-0-3")
     for number, subset in enumerate(_SUBSETS):
         chosen = [sweeps[k] for k in subset]
         yield _recorded(chosen)
         yield _recorded(_worse(chosen, number))
-    for seed in HARD:
+
+
+def simulated_scenes(hard: Iterable[int], plain: Iterable[int]) -> Iterator[JudgedScene]:
+    """Yield the scenes of hard streets and of plain ones, by their seeds."""
+    for seed in hard:
         yield simulated(hard_street(seed), "hard", 1.0)
-    for seed in PLAIN:
+    for seed in plain:
         yield simulated(drawn_street(seed), "plain", _PLAIN_WEIGHT)
 
 
@@ -99,7 +114,17 @@ def simulated(street: Street, source: str, weight: float, seen: LabelledReturns 
     for kind in set(_OF_KIND) & set(seen.kinds):
         what[seen.kind[inside] == seen.kinds.index(kind)] = _OF_KIND[kind]
     scene = make_scene(returns.at(inside), window, window, seen.drive_xyh_m)
-    return JudgedScene(scene, what, street.id, source, weight)
+    types = _shaft_types(seen.objects)[np.maximum(seen.object_id[inside], 0)]
+    return JudgedScene(scene, what, types, street.id, source, weight)
+
+
+def _shaft_types(objects: pd.DataFrame) -> UInt8:
+    """Return the type of the shaft of each object by its number; number 0 is the ground."""
+    out = np.zeros(int(objects.object_id.max()) + 1 if len(objects) else 1, np.uint8)
+    for number, kind, high_m in zip(*(objects[n].tolist() for n in ("object_id", "kind", "size_up_m")), strict=True):
+        name = "delineator" if kind == "pole" and high_m <= LOW_POST_M else SHAFT_OF_KIND.get(kind, "")
+        out[number] = SHAFTS.index(name)
+    return out
 
 
 def in_window(seen: LabelledReturns, street: Street) -> tuple[npt.NDArray[np.int64], Box, Float64, Float64]:
@@ -163,7 +188,10 @@ def _recorded(sweeps: Sequence[_Sweep]) -> JudgedScene:
     inside = window.holds(returns.x_m, returns.y_m)
     drive = np.array([[*one.sensor_m, 1.0] for one in sweeps])
     scene = make_scene(returns.at(inside), window, window, drive)
-    return JudgedScene(scene, table[number[inside]], "street", "recorded", _RECORDED)
+    what = table[number[inside]]
+    types = np.zeros(len(what), np.uint8)
+    types[what == TRUNK], types[what == POLE] = SHAFTS.index("tree"), SHAFTS.index("post")
+    return JudgedScene(scene, what, types, "street", "recorded", _RECORDED)
 
 
 def _returns(sweeps: Sequence[_Sweep]) -> Returns:

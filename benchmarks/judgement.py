@@ -3,7 +3,8 @@
 A question is a file beside this one, `judge_<name>.py`, with a function `segments(folder)` that yields the segments of
 each street with what they are. ``python -m benchmarks.judgement NAME`` fits the trees, writes
 `roadscan/assets/judgement/models/NAME.json` and prints the digest that the code has to name. A file with `TYPES` yields
-the type of each segment instead, and a judge is fitted to each of these. Streets are the groups:
+the type of each segment instead, and a judge is fitted to each of these; its function `asked`, where it has one, turns
+types into the answers. Streets are the groups:
 figures of the record are those of streets, and of parts of a recorded street, that the trees had not seen.
 """
 
@@ -17,6 +18,7 @@ import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Final
 
 import lightgbm
@@ -178,6 +180,13 @@ def written(name: str, content: dict[str, Any], folder: Path = FOLDER) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
+def _asked(question: ModuleType, some: Segments, kind: str) -> Segments:
+    """Segments with the answers to one of the questions of a file."""
+    if hasattr(question, "asked"):
+        return question.asked(some, kind)  # type: ignore[no-any-return]
+    return replace(some, true=some.true == kind) if hasattr(question, "TYPES") else some
+
+
 def main() -> None:
     """Fit the judge of a question."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.judgement", description="Fit the judge of a question.")
@@ -187,7 +196,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         segments = list(question.segments(bench_folder(Path(scratch))))
     for one in getattr(question, "TYPES", (name,)):
-        asked = [replace(s, true=s.true == one) if hasattr(question, "TYPES") else s for s in segments]
+        asked = [_asked(question, s, one) for s in segments]
         content = fit(asked, **getattr(question, "FIT", {}))
         print(json.dumps(content["record"], indent=1, ensure_ascii=False))
         print(f'Judge("{one}", "{written(one, content)}")')

@@ -21,6 +21,12 @@ CLASS_OF_KIND: Final = {
 }  # fmt: skip
 """Class of an object by its kind; of what moves without "moving_"; kinds that are not here are furniture."""
 
+SHAFTS: Final = ("", "pole", "lighting", "signal", "tree", "delineator", "post")
+"""Types of shafts by number: none, five that the stage finds, and a pole of a type that nobody knows."""
+SHAFT_OF_KIND: Final = {"sign": "pole", "pole": "pole", "lamp_post": "lighting", "signal": "signal", "tree": "tree",
+                        "bollard": "delineator"}  # fmt: skip
+"""Type of the shaft of an object by its kind; low poles are delineators."""
+
 
 def class_of_kind(kind: str) -> int:
     """Return the number of the class of an object's kind."""

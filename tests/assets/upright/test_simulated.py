@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from roadscan.assets.kind import AssetObject, asset_kinds, object_names
+from roadscan.assets.upright.standing import TYPES, features_of_types, standing_of, uprights_of
 from tests.assets.upright.scene import objects_of, simulated
 
 SHAFTS = ("pole", "lamp_post", "tree", "sign", "signal")
@@ -128,6 +129,22 @@ def test_clearance_under_the_arm_of_a_lamp() -> None:
     ground = float(scene.ground.height_at(*placed(one)))
     assert one.attributes["clearance_m"] == pytest.approx(one.geometry.z - ground, abs=1e-6)
     assert one.attributes["type"] == "structure"
+
+
+def test_the_probability_of_a_shaft_is_that_of_standing_and_of_its_type() -> None:
+    """The judges of the types are asked, the most probable one names the shaft, and all types share what stands."""
+    scene, _ = simulated()
+    standing = standing_of(scene)
+    features = features_of_types(scene, standing)
+    stated = {kind: judge.probability(features) for kind, judge in TYPES.items()}
+    found = uprights_of(scene)
+    assert len(found) == len(standing.shafts) > 10
+    for k, one in enumerate(found):
+        share = {kind: float(values[k]) for kind, values in stated.items()}
+        assert one.kind == max(share, key=share.__getitem__)
+        expected = float(standing.probability[k]) * share[one.kind] / sum(share.values())
+        assert one.probability == pytest.approx(expected, rel=1e-12)
+        assert one.probability < float(standing.probability[k])
 
 
 def test_signs_name_the_post_that_carries_them() -> None:

@@ -108,14 +108,19 @@ def missed(street: LabelledStreet) -> list[tuple[str, float, float, int]]:
     return out
 
 
-def judged_uprights(street: LabelledStreet) -> Iterator[Judged]:
-    """Objects that stand upright, but for those at which hardly anything was judged."""
+def judged_uprights(street: LabelledStreet, *, by_type: bool = False) -> Iterator[Judged]:
+    """Objects that stand upright, but for those at which hardly anything was judged.
+
+    by_type : a tree is right at a trunk alone, all else at a pole or a sign's post.
+    """
     for kind in UPRIGHT_KINDS:
         for one in street.objects(kind).itertuples():
             seen = _labels_about(street, one.easting_m, one.northing_m, one.height_m)
             if np.isin(seen, NOT_JUDGED).mean() > 0.4:
                 continue
             right = np.isin(seen, (POLE, TRUNK, SIGN)).mean() > 0.3
+            if by_type:
+                right &= bool((np.mean(seen == TRUNK) > np.isin(seen, (POLE, SIGN)).mean()) == (kind == "tree"))
             yield Judged(kind, float(one.probability), float(right))
 
 
@@ -240,7 +245,7 @@ def markings_f1(street: LabelledStreet) -> float:
 
 def judged_objects(street: LabelledStreet) -> list[Judged]:
     """All objects that labels can judge: what stands upright, signs, kerbs, façades, fences and walls, paint."""
-    out = list(judged_uprights(street))
+    out = list(judged_uprights(street, by_type=True))  # their probability is that of their type, too
     edges = labelled_edges(street.places_m, street.labels, (SIDEWALK, TERRAIN)).places
     out += [
         Judged("kerb", one.probability, share_within(points_along([one.geometry]), edges))

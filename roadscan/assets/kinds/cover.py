@@ -243,7 +243,7 @@ def _to_drive(scene: Scene, places: Float64) -> Float64:
     return np.asarray(cKDTree(drive).query(places)[0]) if len(drive) else np.full(len(places), math.inf)
 
 
-COVER, DRAIN = Judge("cover", "ca6cde9aee6bf58d"), Judge("drain", "fa919facd8bfe194")
+COVER, DRAIN = Judge("cover", "76fd8793f59c28e3"), Judge("drain", "3570097163108e5c")
 """Who is asked whether a spot is a cover or a drain, and which of these it is."""
 _LEAST: Final = 0.9
 """Less probable spots are left out: on a street of a sort that the judge has not seen, worn asphalt reaches 0.8."""

@@ -115,6 +115,12 @@ class Assets(Stage):
         if tasks:
             bar = session.bar("squares whose ground is sought in pictures")
             session.failed(self.name, run_units(find_green, tasks, manifest, session.compute, bar))
+        elsewhere = green.elsewhere(manifest)
+        if elsewhere:
+            session.note(
+                f"assets: {len(elsewhere):,} pictures show the ground elsewhere than the lidar does and tell no green "
+                f"ground; check the camera's clock and mounting: {'; '.join(elsewhere[:5])}"
+            )
 
     def _join(self, session: Session, plan: AssetPlan) -> None:
         """Join pieces kind after kind, each after those that it uses."""

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pyarrow as pa
 import pytest
 import shapely
 
 from roadscan.assets.edges.along_drive import BESIDE_PIECES
+from roadscan.assets.green import colours
 from roadscan.assets.green.areas import GREEN_CELLS, Sums, green_rows, mosaic_of
 from roadscan.assets.green.cells import CELL_M
-from roadscan.assets.green.colours import FINE, FINE_M, Look, greenness, linear
+from roadscan.assets.green.colours import FINE, FINE_M, Ground, Look, PlacedGround, greenness, linear
 from roadscan.assets.kinds.landscape_area import PIECE_SCHEMA, WHOLE, LandscapeArea, LandscapeOptions
 from roadscan.assets.kinds.road_edge import RoadEdge
 from roadscan.assets.kinds.sidewalk import Sidewalk
@@ -43,6 +46,32 @@ def test_greenness_knows_grass_in_any_light(gains: tuple[float, float, float]) -
 def test_greenness_says_nothing_of_black_and_of_white() -> None:
     index = greenness(np.array([(3, 5, 3), (255, 255, 255)], np.uint8), linear(np.array(ASPHALT, np.uint8)))
     assert np.isnan(index).all()
+
+
+@pytest.mark.parametrize(("moved_m", "expected"), [(0.0, False), (1.5, True), (-3.0, True)])
+def test_a_picture_that_shows_the_ground_elsewhere_is_not_believed(
+    moved_m: float, expected: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Spots of paint at random, as the lidar sees them and as a picture does that is off to the east."""
+    spots = np.random.default_rng(5).random((60, 60)) < 0.2
+    row, column = (a.ravel() for a in np.indices((SIDE, SIDE)))
+    none = np.zeros(row.size)
+
+    def painted(x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+        return spots[np.floor(y_m / 0.5).astype(int) + 15, np.floor(x_m / 0.5).astype(int) + 15]
+
+    def shown(picture: object, one: object, worlds_m: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        place = worlds_m[0].reshape(-1, 3)
+        bright = np.where(painted(place[:, 0] - moved_m, place[:, 1]), 200, 90).astype(np.uint8)
+        return np.repeat(bright[:, None], 3, axis=1), np.ones(len(place), np.bool_)
+
+    x_m, y_m = (column + 0.5) * CELL_M, (row + 0.5) * CELL_M
+    intensity = np.where(painted(x_m, y_m), 190.0, 60.0)
+    ground = Ground(column, row, none, intensity, none, none > 0.0, np.zeros((row.size, 2)))
+    placed = PlacedGround(ground, (ground.places_m,), (np.eye(3),))
+    monkeypatch.setattr(colours, "_colours", shown)
+    nothing: Any = None
+    assert colours._lies_elsewhere(nothing, nothing, placed, np.arange(row.size)) is expected
 
 
 def whole_window() -> tuple[np.ndarray, np.ndarray]:

@@ -121,6 +121,10 @@ def ground_of(rows: pa.Table, box: Bounds) -> tuple[Ground, pa.Table]:
     return ground, own
 
 
+class Elsewhere:
+    """A picture that does not lie where its time and pose say."""
+
+
 @dataclass(frozen=True, eq=False)
 class Look:
     """What one picture tells of k cells."""
@@ -155,8 +159,8 @@ def greenness(colours: UInt8, paved: Float64) -> Float64:
 
 def looked_at(
     picture: UInt8, pictures: Pictures, number: int, placed: PlacedGround, hidden: Callable[[Float64], Bool]
-) -> Look | None:
-    """Returns what a picture tells of the ground; None where it tells nothing or is not to be believed.
+) -> Look | Elsewhere | None:
+    """Returns what a picture tells of the ground; None where it tells nothing.
 
     hidden : says of places (n, 3) which of them something hides from it.
     """
@@ -180,7 +184,7 @@ def looked_at(
         return None
     reference = np.maximum(np.median(linear(own), axis=0), 1e-4)
     if _lies_elsewhere(picture, one, placed, near[seen]):
-        return None
+        return Elsewhere()
     cells = near[seen]
     colour, shown = _colours(picture, one, placed.stepped(cells, ground.fine_steps_m(cells)))
     index = np.where(shown, greenness(colour, reference), np.nan).reshape(-1, FINE * FINE)

@@ -8,7 +8,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 
 from roadscan.assets.green.areas import MARGIN_CELLS, Mosaic, Sums, green_rows, mosaic_of
 from roadscan.assets.green.cells import CELL_M
-from roadscan.assets.green.colours import REACH_M, Ground, PlacedGround, ground_of, looked_at
+from roadscan.assets.green.colours import REACH_M, Elsewhere, Ground, PlacedGround, ground_of, looked_at
 from roadscan.assets.settings import picture_rule
 from roadscan.assets.tasks.evidence import GROUND, SCREENS
 from roadscan.assets.tasks.objects import GREEN
@@ -73,6 +73,11 @@ class GreenPlan:
     def due(self, manifest: Manifest) -> list[TileId]:
         """Returns those that are missing or stale."""
         return [square for square, key in self.keys.items() if not manifest.is_current(GREEN, str(square), key)]
+
+    def elsewhere(self, manifest: Manifest) -> list[str]:
+        """Returns the names of the pictures that do not lie where their times and poses say."""
+        details = (record.detail for unit, record in manifest.of(GREEN).items() if TileId.parse(unit) in self.keys)
+        return sorted({name for detail in details for name in json.loads(detail).get("elsewhere", ())})
 
     def gone(self, manifest: Manifest) -> list[OutputRecord]:
         """Returns outputs of squares that no picture shows any more."""
@@ -153,14 +158,14 @@ def _found(
     ground: Mapping[TileId, pa.Table],
     screens: Mapping[TileId, pa.Table],
     source: ColourSource,
-) -> tuple[pa.Table, dict[str, int]]:
-    """Returns rows of a square's planted cells, and how many pictures told of it and how many were not believed."""
+) -> tuple[pa.Table, dict[str, Any]]:
+    """Returns rows of a square's planted cells, how many pictures told of it, and which lie elsewhere."""
     held = dict(task.ground)
     rows = pa.concat_tables([ground[name] for name, _ in _around(task.grid, square, held)])
     cells, rows = ground_of(rows, _box(task.grid, square, _AROUND_M))
     hides = [screens[name] for name, _ in _around(task.grid, square, dict(task.screens))]
     near = task.pictures.near(_box(task.grid, square))
-    sums, told, doubted = Sums(len(cells.column)), 0, 0
+    sums, told, elsewhere = Sums(len(cells.column)), 0, list[str]()
     placed = PlacedGround.of(cells, near)
     voxels = pa.concat_tables([SCREEN_ROWS.empty_table(), *hides])
     for number in range(len(near)):
@@ -169,8 +174,9 @@ def _found(
             continue
         hidden = functools.partial(hidden_cells, near, number, screens=voxels)
         look = looked_at(picture, near, number, placed, hidden)
-        if look is None:
-            doubted += 1
+        if isinstance(look, Elsewhere):
+            elsewhere.append(near.name(number))
+        if look is None or isinstance(look, Elsewhere):
             continue
         sums.add(look, int(bytes_digest(near.name(number).encode())[-1], 16) & 1)
         told += 1
@@ -179,7 +185,7 @@ def _found(
     table = green_rows(
         mosaic, first, rows, (own.easting_min_m, own.northing_min_m, own.easting_max_m, own.northing_max_m)
     )
-    return table, {"pictures": told, "doubted": doubted}
+    return table, {"pictures": told, "elsewhere": elsewhere}
 
 
 def _window(grid: AssetGrid, square: TileId, cells: Ground, sums: Sums) -> tuple[Mosaic, tuple[int, int]]:
@@ -192,7 +198,7 @@ def _window(grid: AssetGrid, square: TileId, cells: Ground, sums: Sums) -> tuple
     return mosaic_of(sums, inside, (row[inside], column[inside]), shape, cells.drive_m[inside]), first
 
 
-def _record(task: GreenTask, square: TileId, key: str, found: tuple[pa.Table, dict[str, int]]) -> OutputRecord:
+def _record(task: GreenTask, square: TileId, key: str, found: tuple[pa.Table, dict[str, Any]]) -> OutputRecord:
     rows, counts = found
     detail = json.dumps({"cells": rows.num_rows, **counts})
     if not rows.num_rows:

@@ -23,6 +23,7 @@ from roadscan.core.errors import ConfigError, RunError
 from roadscan.core.grid import Bounds, TileId
 from roadscan.core.survey import Survey
 from roadscan.ingest.ingest import ingest
+from roadscan.ingest.reading.format import format_named
 from roadscan.run.engine.compute import Inline
 from roadscan.run.engine.compute_on import compute_on
 from roadscan.run.session import Selection, Session
@@ -337,7 +338,11 @@ finally:
 def test_a_command_imports_no_library_that_it_does_not_use(
     command: list[str], more: set[str], less: set[str], finished: Simulated, tmp_path: Path
 ) -> None:
-    """Seconds are not counted, which a busy machine stretches: these libraries take most of them."""
+    """Seconds are not counted, which a busy machine stretches: these libraries take most of them.
+
+    Which module holds a format is found once for new sources, by the first command that asks: here by the test.
+    """
+    assert format_named("sbet").name == "sbet"
     control = tmp_path / "control.csv"
     control.write_text("name,easting_m,northing_m,height_m\nP1,691015.1,5335013.4,560.3\n", encoding="utf-8")
     files = {"CONTROL": str(control), "SURVEY": str(finished.survey_file)}

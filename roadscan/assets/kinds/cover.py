@@ -246,8 +246,8 @@ def _to_drive(scene: Scene, places: Float64) -> Float64:
 COVER, DRAIN = Judge("cover", "76fd8793f59c28e3"), Judge("drain", "fa919facd8bfe194")
 """Who is asked whether a spot is a cover or a drain, and which of these it is."""
 _LEAST: Final = 0.85
-"""Less probable spots are left out: of those that the fit held out, 0.73 on crowded streets, 0.96 among look-alikes and all
-on plain ones are right from here on; from 0.8 on 0.55 on crowded ones."""
+"""Less probable spots are left out: of those that the fit held out, 0.73 on crowded streets, 0.96 among what is like
+covers and all on plain ones are right from here on; from 0.8 on 0.55 on crowded ones."""
 _LEAST_DRAIN: Final = 0.5  # More probable ones are drains.
 _SPOTS_APART_M: Final = 0.4  # Spots nearer to one another (m) are one.
 _PLACE_SIGMA_M: Final = 0.05  # 1 σ of the middle of a spot (m), half the distance of scan lines.

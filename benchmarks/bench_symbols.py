@@ -6,17 +6,17 @@ Streets 730 and 731 were looked at when the drawings were made; 740 to 743 are o
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import geopandas
 import numpy as np
 
+from benchmarks.bench_wires_covers import Counts, products_of
 from benchmarks.drawn_streets import street_of_symbols
-from benchmarks.labelled_street import run
 from benchmarks.timing import Figure
-from roadscan.simulate import Scene, simulate
+from roadscan.simulate import Scene
 from roadscan.simulate.surface import Surface
 
 LOOKED_AT: Final = {730: "HDL-32E", 731: "OS1-128"}
@@ -27,7 +27,7 @@ _SYMBOL_M, _MARKER_M = 1.2, 0.2
 
 
 @dataclass
-class Score:
+class Score(Counts):
     """Numbers of things on some streets."""
 
     symbols: int = 0
@@ -43,10 +43,6 @@ class Score:
     lines_in_lanes: int = 0
     """Lane lines over a symbol, where none is painted."""
 
-    def __add__(self, other: Score) -> Score:
-        """The sums of both."""
-        return Score(*(getattr(self, one.name) + getattr(other, one.name) for one in fields(self)))
-
 
 def figures(folder: Path) -> Iterator[Figure]:
     """Both groups of streets."""
@@ -54,7 +50,8 @@ def figures(folder: Path) -> Iterator[Figure]:
     for name, streets in groups.items():
         total = Score()
         for seed, model in streets.items():
-            total += score(seen_by(street_of_symbols(seed), model), folder / f"symbols {seed}")
+            street = seen_by(street_of_symbols(seed), model)
+            total += scored(street, products_of(street, folder / f"symbols {seed}"))
         yield Figure(f"{name}: symbols, found", total.found, "", total.symbols, "that lie there")
         yield Figure(f"{name}: of these, named right", total.right, "")
         yield Figure(f"{name}: of these, named wrong", total.wrong, "")
@@ -69,16 +66,6 @@ def seen_by(street: Scene, model: str) -> Scene:
     in_bag = model == "VLP-16"  # its packets are recorded in a bag
     bag = {"on": in_bag, "trajectory": in_bag}
     return street.changed(bag=bag, lidar=street.lidar.model_dump() | {"model": model})
-
-
-def score(street: Scene, folder: Path) -> Score:
-    """The street, simulated, run from its survey file, and held against its truth."""
-    file = folder / "SURVEY.toml"
-    simulate(street, folder)
-    file.write_text(f"{file.read_text()}\n[assets]\n")
-    run(file)
-    (products,) = folder.glob("store/*/products/assets")
-    return scored(street, products)
 
 
 def scored(street: Scene, products: Path) -> Score:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Final
+from typing import Final, Self
 
 import geopandas
 import numpy as np
@@ -35,7 +35,16 @@ _WIRE_M, _COVER_M = 0.3, 0.35
 
 
 @dataclass
-class Score:
+class Counts:
+    """Numbers that add up over streets."""
+
+    def __add__(self, other: Self) -> Self:
+        """The sums of both."""
+        return type(self)(*(getattr(self, one.name) + getattr(other, one.name) for one in fields(self)))
+
+
+@dataclass
+class Score(Counts):
     """What was found on some streets: lengths in metres, numbers of covers."""
 
     wires_m: float = 0.0
@@ -48,10 +57,6 @@ class Score:
     typed: int = 0
     """Of the found ones, those with their type."""
     false: int = 0
-
-    def __add__(self, other: Score) -> Score:
-        """The sums of both."""
-        return Score(*(getattr(self, one.name) + getattr(other, one.name) for one in fields(self)))
 
 
 def figures(folder: Path) -> Iterator[Figure]:
@@ -78,13 +83,18 @@ def _recorded(street: Scene, model: str) -> Scene:
 
 def score(street: Scene, folder: Path) -> Score:
     """The street, simulated, run from its survey file, and held against its truth."""
+    products, surface = products_of(street, folder), Surface(street)
+    return _wires(street, surface, products) + _covers(street, surface, products)
+
+
+def products_of(street: Scene, folder: Path) -> Path:
+    """The folder of the assets of a street that is simulated and run from its survey file, with default settings."""
     file = folder / "SURVEY.toml"
     simulate(street, folder)
     file.write_text(f"{file.read_text()}\n[assets]\n")
     run(file)
     (products,) = folder.glob("store/*/products/assets")
-    surface = Surface(street)
-    return _wires(street, surface, products) + _covers(street, surface, products)
+    return products
 
 
 def _wires(street: Scene, surface: Surface, products: Path) -> Score:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
@@ -94,14 +95,17 @@ def street_of_furniture(seed: int) -> Scene:
     return street.changed(id=f"furniture-{seed}", roadside=held, lidar=lidar, bag={"on": True})
 
 
+def _between(random: np.random.Generator) -> Callable[[float, float], float]:
+    """Draws of numbers between two."""
+    return lambda low, high: float(random.uniform(low, high))
+
+
 def street_of_covers(seed: int) -> Scene:
     """A drawn street with covers in its lanes, drains at its kerbs and wires over it, seen by one of four lidars."""
     random = np.random.default_rng([seed, 43])
     street = drawn_street(seed)
     paved = street.road.paved_m
-
-    def between(low: float, high: float) -> float:
-        return float(random.uniform(low, high))
+    between = _between(random)
 
     def wire(station: float, to_station: float, offset: float, to_offset: float, height: float) -> dict[str, float]:
         return {"station_m": station, "to_station_m": to_station, "offset_m": offset, "to_offset_m": to_offset,
@@ -140,9 +144,7 @@ def street_of_lookalikes(seed: int) -> Scene:
     random = np.random.default_rng([seed, 47])
     street = street_of_covers(seed)
     paved = street.road.paved_m
-
-    def between(low: float, high: float) -> float:
-        return float(random.uniform(low, high))
+    between = _between(random)
 
     def somewhere() -> dict[str, float]:
         return {"station_m": between(0.0, LENGTH_M), "offset_m": between(-paved + 0.4, paved - 0.4)}
@@ -184,9 +186,7 @@ def street_of_shafts(seed: int, *, lamp_arm_m: float = 3.0) -> Scene:
     random = np.random.default_rng([seed, 53])
     street = drawn_street(seed)
     near = street.road.paved_m
-
-    def between(low: float, high: float) -> float:
-        return float(random.uniform(low, high))
+    between = _between(random)
 
     held = street.roadside.model_dump() | {"trees": [], "lamp_posts": [], "signals": []}
     for station in np.arange(1.0, LENGTH_M, 3.2):
@@ -234,9 +234,7 @@ def street_of_symbols(seed: int) -> Scene:
     """A drawn street with symbols in both lanes, some worn, and raised markers, seen by one of four lidars."""
     random = np.random.default_rng([seed, 53])
     street = drawn_street(seed)
-
-    def between(low: float, high: float) -> float:
-        return float(random.uniform(low, high))
+    between = _between(random)
 
     symbols = []
     for station, offset in itertools.product(np.arange(3.0, LENGTH_M - 2.0, 6.5), (-1.55, 1.55)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 import json
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -12,9 +13,10 @@ from typing import Any, Final, TypeVar, cast
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.parquet as pq
 
 from roadscan.core.errors import DamagedError, StoreError
-from roadscan.store.digest import bytes_hold, checked_json, parse_checked
+from roadscan.store.digest import bytes_digest, bytes_hold, checked_json, parse_checked
 from roadscan.store.records import RECORDS, OutputRecord, Packed, Row, latest, rows_of, sound_rows, table_of, unpacked
 from roadscan.store.store import MADE_AGAIN, Store
 
@@ -369,6 +371,15 @@ def read_recorded(store: Store, record: OutputRecord) -> bytes:
 def recorded_table(store: Store, record: OutputRecord, columns: Sequence[str] | None = None) -> pa.Table:
     """Return an output that is a Parquet file, or some of its columns, verified as by :func:`read_recorded`."""
     return store.parse_table(read_recorded(store, record), record.path, columns)
+
+
+def publish_table(store: Store, rows: pa.Table, name: str, unit: str, key: str, detail: str) -> OutputRecord:
+    """Write the rows of a unit as a file of that name's table; return its record for the manifest."""
+    stream = io.BytesIO()
+    pq.write_table(rows, stream, compression="zstd", write_page_checksum=True, version="2.6")
+    content, target = stream.getvalue(), f"tables/{name}/{unit}.parquet"
+    store.write_bytes(target, content, lasting=False)
+    return OutputRecord(name, unit, key, target, len(content), bytes_digest(content), detail)
 
 
 def recorded_rows(store: Store, records: Iterable[OutputRecord]) -> list[dict[str, Any]]:

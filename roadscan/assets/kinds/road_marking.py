@@ -16,7 +16,7 @@ from roadscan.assets.classes import MARKING
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
 from roadscan.assets.paint.components import CELL_M
 from roadscan.assets.paint.detection import SYMBOL_M, Paint, Patch, height_sigma, paint_of, rows_of_paint
-from roadscan.assets.paint.symbols import ARROWS, symbol_of
+from roadscan.assets.paint.symbols import ARROWS, symbol_of, turned
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.slices import places_of
 from roadscan.compute.array_types import Bool
@@ -87,35 +87,38 @@ _BAR_FILLED: Final = 0.7  # Least share of its rectangle that a bar covers.
 _ARROW_ALONG_M: Final = 1.2  # Least extent of an arrow along the road (m).
 
 
-def told_of(outline: shapely.Geometry, painted: shapely.Geometry, road_rad: float) -> tuple[str, str | None]:
+def type_and_symbol(outline: shapely.Geometry, painted: shapely.Geometry, road_rad: float) -> tuple[str, str | None]:
     """Returns the type of a polygon in the map with its paint, and what an arrow or a symbol shows.
 
     road_rad : direction of the road (rad, anticlockwise from east).
     """
-    turned = _turned(painted, road_rad)
-    along_min, across_min, along_max, across_max = turned.bounds
-    along, across = along_max - along_min, across_max - across_min
+    flat = turned(painted, road_rad)
+    along, across = _sides(flat)
     if max(along, across) <= _MARKER_M:
         return "raised_marker", None
-    filled = outline.area / max(shapely.minimum_rotated_rectangle(outline).area, 1e-9)
-    if (
-        _BAR_ALONG_M[0] <= along <= _BAR_ALONG_M[1]
-        and across >= max(_BAR_ACROSS_M, 2.0 * along)
-        and filled >= _BAR_FILLED
-    ):
+    if is_stop_bar(outline, along, across):
         return "stop_bar", None
-    shows = symbol_of(turned)
+    shows = symbol_of(flat)
     if shows in ARROWS and along >= _ARROW_ALONG_M:
         return "arrow", shows
     return ("symbol", shows) if max(along, across) <= SYMBOL_M else ("area", None)
 
 
-def _turned(outline: shapely.Geometry, road_rad: float) -> shapely.Geometry:
-    """Returns the outline with the road's direction along x."""
-    cos, sin = np.cos(road_rad), np.sin(road_rad)
-    turn = np.array([[cos, -sin], [sin, cos]])
-    middle = shapely.get_coordinates(outline.centroid)
-    return shapely.transform(shapely.force_2d(outline), lambda xy: (xy - middle) @ turn)
+def is_stop_bar(outline: shapely.Geometry, along_m: float, across_m: float) -> bool:
+    """Returns whether a polygon is a bar across the road, by its extent along the road and across it."""
+    filled = outline.area / max(shapely.minimum_rotated_rectangle(outline).area, 1e-9)
+    return bool(
+        max(along_m, across_m) > _MARKER_M
+        and _BAR_ALONG_M[0] <= along_m <= _BAR_ALONG_M[1]
+        and across_m >= max(_BAR_ACROSS_M, 2.0 * along_m)
+        and filled >= _BAR_FILLED
+    )
+
+
+def _sides(outline: shapely.Geometry) -> tuple[float, float]:
+    """Returns the extent of an outline along x and y."""
+    x_min, y_min, x_max, y_max = outline.bounds
+    return x_max - x_min, y_max - y_min
 
 
 _TOUCHING_M: Final = 0.03  # Pieces this near to one another (m) touch.
@@ -161,9 +164,9 @@ def _object(shapes: npt.NDArray[Any], table: pa.Table) -> AssetObject:
     roads = table["road_rad"].to_numpy()
     road = float(roads[np.isfinite(roads)][0]) if np.isfinite(roads).any() else _own_direction(outline)
     bar = _without_lines(outline)
-    if not crosswalk and told_of(bar, bar, road)[0] == "stop_bar":
+    if not crosswalk and is_stop_bar(bar, *_sides(turned(bar, road))):
         outline = painted = bar
-    kind, shows = ("crosswalk", None) if crosswalk else told_of(outline, painted, road)
+    kind, shows = ("crosswalk", None) if crosswalk else type_and_symbol(outline, painted, road)
     along, across = _extent(outline, road)
     returns = np.maximum(table["returns"].to_numpy(), 1)
     return AssetObject(

@@ -21,7 +21,7 @@ from roadscan.assets.classes import ROAD
 from roadscan.assets.judgement.judge import Judge
 from roadscan.assets.paint.components import CELL_M, Component, Contrast, components_of, contrast_of
 from roadscan.assets.paint.stripes import AROUND_M, RoadDirection, Stripe, stripes_of
-from roadscan.assets.paint.symbols import UNKNOWN, symbol_of
+from roadscan.assets.paint.symbols import UNKNOWN, symbol_of, turned
 from roadscan.assets.scene import Box, Scene, once_a_scene
 from roadscan.compute.array_types import Bool, Float64, Int64
 
@@ -281,12 +281,15 @@ def _is_symbol(one: Component, road: RoadDirection) -> bool:
     direction = road.at(float(one.cell_x_m.mean()), float(one.cell_y_m.mean()))
     if not math.isfinite(direction):
         return False
-    cos, sin = math.cos(direction), math.sin(direction)
-    if np.ptp(y * cos - x * sin) < _SYMBOL_ACROSS_M:
+    if np.ptp(y * math.cos(direction) - x * math.sin(direction)) < _SYMBOL_ACROSS_M:
         return False
-    half = CELL_M / 2
-    shape = shapely.union_all(shapely.box(x - half, y - half, x + half, y + half))
-    return symbol_of(shapely.transform(shape, lambda xy: xy @ np.array([[cos, -sin], [sin, cos]]))) != UNKNOWN
+    return symbol_of(turned(_shape_of(one), direction)) != UNKNOWN
+
+
+def _shape_of(one: Component) -> shapely.Geometry:
+    """Returns the outline of a component's cells."""
+    x, y, half = one.cell_x_m, one.cell_y_m, CELL_M / 2
+    return shapely.union_all(shapely.box(x - half, y - half, x + half, y + half))
 
 
 def judged(scene: Scene, found: Contrast, components: Sequence[Component]) -> list[Component]:
@@ -337,9 +340,7 @@ def _of_stripe(stripe: Stripe, crossed: bool, road_rad: float) -> Patch:
 def _of_cells(found: Contrast, component: Component, crossed: bool, road_rad: float) -> Patch:
     from scipy.spatial import cKDTree
 
-    half = CELL_M / 2
-    x, y = component.cell_x_m, component.cell_y_m
-    shape = shapely.union_all(shapely.box(x - half, y - half, x + half, y + half))
+    x, y, shape = component.cell_x_m, component.cell_y_m, _shape_of(component)
     inside, outside = component.near[component.inside], component.near[~component.inside]
     away, _ = cKDTree(np.stack([x, y], axis=1)).query(
         np.stack([found.x_m[outside], found.y_m[outside]], axis=1), distance_upper_bound=AROUND_M

@@ -33,6 +33,14 @@ _EXTENT_M: Final = 1.0
 """Least extent along the road (m): smaller paint is a fragment."""
 
 
+def turned(outline: shapely.Geometry, road_rad: float) -> shapely.Geometry:
+    """Returns an outline about its middle, with the road's direction (rad, anticlockwise from east) along x."""
+    cos, sin = np.cos(road_rad), np.sin(road_rad)
+    turn = np.array([[cos, -sin], [sin, cos]])
+    middle = shapely.get_coordinates(outline.centroid)
+    return shapely.transform(shapely.force_2d(outline), lambda xy: (xy - middle) @ turn)
+
+
 def symbol_of(outline: shapely.Geometry) -> str:
     """Returns what an outline shows, x along the road in either direction; `unknown` where no drawing is alike.
 

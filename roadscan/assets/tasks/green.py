@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import io
 import json
 import math
 from collections.abc import Mapping
@@ -12,7 +11,6 @@ from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from roadscan.assets.green.areas import MARGIN_CELLS, Mosaic, Sums, green_rows, mosaic_of
 from roadscan.assets.green.cells import CELL_M
@@ -31,7 +29,7 @@ from roadscan.pictures.placed import Pictures, plan_pictures
 from roadscan.run.engine.compute import reason_of
 from roadscan.run.keys import code_digest, key_of
 from roadscan.store.digest import bytes_digest
-from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
+from roadscan.store.manifest import Manifest, OutputRecord, publish_table, recorded_table
 from roadscan.store.store import Store
 from roadscan.tiles.tasks.tiles import TaskResult
 
@@ -176,10 +174,9 @@ def _found(
         look = looked_at(picture, near, number, placed, hidden)
         if isinstance(look, Elsewhere):
             elsewhere.append(near.name(number))
-        if look is None or isinstance(look, Elsewhere):
-            continue
-        sums.add(look, int(bytes_digest(near.name(number).encode())[-1], 16) & 1)
-        told += 1
+        elif look is not None:
+            sums.add(look, int(bytes_digest(near.name(number).encode())[-1], 16) & 1)
+            told += 1
     mosaic, first = _window(task.grid, square, cells, sums)
     own = _box(task.grid, square, 0.0)
     table = green_rows(
@@ -203,8 +200,4 @@ def _record(task: GreenTask, square: TileId, key: str, found: tuple[pa.Table, di
     detail = json.dumps({"cells": rows.num_rows, **counts})
     if not rows.num_rows:
         return OutputRecord(GREEN, str(square), key, "", 0, "", detail)
-    stream = io.BytesIO()
-    pq.write_table(rows, stream, compression="zstd", write_page_checksum=True, version="2.6")
-    content, target = stream.getvalue(), f"tables/{GREEN}/{square}.parquet"
-    task.store.write_bytes(target, content, lasting=False)
-    return OutputRecord(GREEN, str(square), key, target, len(content), bytes_digest(content), detail)
+    return publish_table(task.store, rows, GREEN, str(square), key, detail)

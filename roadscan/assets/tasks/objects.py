@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from roadscan.assets.kind import AssetObject, asset_kinds, objects_of_table, table_of_objects
 from roadscan.assets.probabilities import curve_named
@@ -20,8 +18,7 @@ from roadscan.core.strict import Strict
 from roadscan.run.engine.compute import damaged_file, reason_of
 from roadscan.run.keys import key_of
 from roadscan.store.asset_schema import asset_schema
-from roadscan.store.digest import bytes_digest
-from roadscan.store.manifest import Manifest, OutputRecord, recorded_table
+from roadscan.store.manifest import Manifest, OutputRecord, publish_table, recorded_table
 from roadscan.store.store import Store
 from roadscan.tiles.tasks.tiles import TaskResult
 
@@ -177,12 +174,7 @@ def _joined(task: JoinTask) -> OutputRecord:
     unit = task.cluster.unit
     if not rows.num_rows:
         return OutputRecord(OBJECTS, unit, task.key, "", 0, "", '{"objects": 0}')
-    stream = io.BytesIO()
-    pq.write_table(rows, stream, compression="zstd", write_page_checksum=True, version="2.6")
-    content, target = stream.getvalue(), f"tables/{OBJECTS}/{unit}.parquet"
-    task.store.write_bytes(target, content, lasting=False)
-    detail = f'{{"objects": {rows.num_rows}}}'
-    return OutputRecord(OBJECTS, unit, task.key, target, len(content), bytes_digest(content), detail)
+    return publish_table(task.store, rows, OBJECTS, unit, task.key, f'{{"objects": {rows.num_rows}}}')
 
 
 def _near(task: JoinTask, records: Sequence[OutputRecord], near: set[TileId]) -> list[AssetObject]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,7 +10,6 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from roadscan.assets.kernels.sight import find_hidden
 from roadscan.assets.kind import AssetObject, objects_of_table
@@ -27,7 +25,7 @@ from roadscan.pictures.placed import Pictures
 from roadscan.pictures.views import NO_VIEW, WIDTH, Sights, best_views, sights
 from roadscan.run.engine.compute import reason_of
 from roadscan.store.digest import bytes_digest
-from roadscan.store.manifest import OutputRecord, recorded_table
+from roadscan.store.manifest import OutputRecord, publish_table, recorded_table
 from roadscan.tiles.tasks.tiles import TaskResult
 
 _WALKED_M: Final = np.array([1.5, 0.8, 0.25])
@@ -167,17 +165,11 @@ class _Search:
         answer = self._answer(one, objects, rows["object"].to_pylist())
         table = pa.table([rows["object"], answer.pictures, [json.dumps(t, ensure_ascii=False) for t in answer.told]],
                          schema=TOLD)  # fmt: skip
-        stream = io.BytesIO()
-        pq.write_table(table, stream, compression="zstd", write_page_checksum=True, version="2.6")
         detail = {
             "objects": len(objects), "shown": sum(p is not None for p in answer.pictures),
             "cut_outs": [record.unit for record in answer.files], "unreadable": sorted(answer.unreadable),
         }  # fmt: skip
-        content, target = stream.getvalue(), f"tables/{SEEN}/{one.unit}.parquet"
-        self._task.store.write_bytes(target, content, lasting=False)
-        seen = OutputRecord(
-            SEEN, one.unit, one.key, target, len(content), bytes_digest(content), json.dumps(detail, ensure_ascii=False)
-        )
+        seen = publish_table(self._task.store, table, SEEN, one.unit, one.key, json.dumps(detail, ensure_ascii=False))
         return [*answer.files, seen]
 
     def _answer(self, one: SquareObjects, objects: Sequence[AssetObject], names: Sequence[str]) -> _Answer:

@@ -76,9 +76,7 @@ def crown(near: About, shaft: Shaft, others_xy: Float64) -> tuple[float, float, 
 
     others_xy : (k, 2) axes of the other trunks about.
     """
-    own = np.ones(near.rows.size, np.bool_)
-    for x, y in others_xy.tolist():
-        own &= np.hypot(near.right_m - x, near.ahead_m - y) > near.away_m
+    own = _nearest(near, others_xy)
     close = own & (near.away_m < 1.5)
     low = max(1.5, float(np.quantile(near.above_m[close], 0.05))) if close.any() else 1.5
     own &= near.above_m >= low
@@ -89,6 +87,14 @@ def crown(near: About, shaft: Shaft, others_xy: Float64) -> tuple[float, float, 
     column = own & (near.away_m < 1.5)
     top = float(np.quantile(near.above_m[column], 0.995)) if column.any() else shaft.top_above_m
     return max(top, shaft.top_above_m), 2.0 * float(np.mean(radii)) if radii else float("nan"), near.rows[own]
+
+
+def _nearest(near: About, others_xy: Float64) -> Bool:
+    """Returns which returns (n,) are nearer to a shaft than to others, whose axes (k, 2) count from its axis."""
+    nearest = np.ones(near.rows.size, np.bool_)
+    for x, y in others_xy.tolist():
+        nearest &= np.hypot(near.right_m - x, near.ahead_m - y) > near.away_m
+    return nearest
 
 
 def arms(near: About, shaft: Shaft) -> Arms | None:
@@ -146,9 +152,7 @@ def attached(scene: Scene, shaft: Shaft, near: About, others_xy: Float64) -> dic
     others_xy : (k, 2) axes of the other shafts about, from its own. NaN where too few returns tell a feature.
     """
     out = arms(near, shaft)
-    own = np.ones(near.rows.size, np.bool_)
-    for x, y in others_xy.tolist():
-        own &= np.hypot(near.right_m - x, near.ahead_m - y) > near.away_m
+    own = _nearest(near, others_xy)
     reach_m = out.reach_m if out else 0.0
     at_end = near.away_m < 0.0
     if out is not None:

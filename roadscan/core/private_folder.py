@@ -116,7 +116,7 @@ def kept(name: str, make: Callable[[], str]) -> str:
     ----------
     name : what the text is of; one name stands for one text, whatever process asks.
     """
-    folder = _folder()
+    folder = _checked(cache_place() / "of-sources")
     if folder is None:
         return make()
     file = folder / hashlib.blake2b(name.encode(), digest_size=12).hexdigest()
@@ -144,9 +144,8 @@ def sources_digest() -> str:
 
 
 @functools.cache
-def _folder() -> Path | None:
-    """Folder of what was kept; None where it cannot be written, or others could write to it."""
-    folder = cache_place() / "of-sources"
+def _checked(folder: Path) -> Path | None:
+    """The folder, made where it is missing; None where it cannot be written, or others could write to it."""
     try:
         make_private(folder)
         check_private(folder)

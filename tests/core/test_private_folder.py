@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from roadscan.core.private_folder import UnsafeFolderError, check_private, make_private
+from roadscan.core.private_folder import UnsafeFolderError, check_private, kept, make_private
 
 NOBODY = 65534
 as_root = pytest.mark.skipif(os.getuid() != 0, reason="only root can give a file to another user")
@@ -127,3 +127,11 @@ def test_the_command_line_says_it_in_one_line(tmp_path: Path) -> None:
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 2 and "Traceback" not in done.stderr
     assert f"roadscan: {folder}: the cache of compiled code can be written by every user" in done.stderr
+
+
+def test_what_is_kept_follows_the_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process whose place changes keeps nothing more in the former one."""
+    for place in ("first", "second"):
+        monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / place))
+        assert kept("a text", lambda: place) == place  # noqa: B023
+        assert kept("a text", lambda: "another") == place

@@ -23,7 +23,6 @@ from roadscan.core.errors import ConfigError, RunError
 from roadscan.core.grid import Bounds, TileId
 from roadscan.core.survey import Survey
 from roadscan.ingest.ingest import ingest
-from roadscan.ingest.reading.format import format_named
 from roadscan.run.engine.compute import Inline
 from roadscan.run.engine.compute_on import compute_on
 from roadscan.run.session import Selection, Session
@@ -340,14 +339,14 @@ def test_a_command_imports_no_library_that_it_does_not_use(
 ) -> None:
     """Seconds are not counted, which a busy machine stretches: these libraries take most of them.
 
-    Which module holds a format is found once for new sources, by the first command that asks: here by the test.
+    Which module holds a format is found once for new sources, by the first command that asks: so each runs twice.
     """
-    assert format_named("sbet").name == "sbet"
     control = tmp_path / "control.csv"
     control.write_text("name,easting_m,northing_m,height_m\nP1,691015.1,5335013.4,560.3\n", encoding="utf-8")
     files = {"CONTROL": str(control), "SURVEY": str(finished.survey_file)}
     words = [files.get(word, word) for word in command]
-    found = subprocess.run([sys.executable, "-c", LOADED, *words], capture_output=True, text=True, check=False)
+    for _ in range(2):
+        found = subprocess.run([sys.executable, "-c", LOADED, *words], capture_output=True, text=True, check=False)
     loaded = set(found.stderr.splitlines()[-1].split())
     assert "roadscan.cli.added_stages" in loaded
     assert found.stdout and "leaked" not in found.stderr

@@ -79,13 +79,13 @@ def test_pixels_become_returns_along_their_beams() -> None:
 def test_lzf_expands_what_liblzf_compressed() -> None:
     random = np.random.default_rng(1)
     for content in (b"a" * 1_000, bytes(random.integers(0, 4, 2_000, dtype="u1")), b"abcabcabcabd" * 40):
-        packed = np.frombuffer(lzf.compress(content), np.uint8)
+        packed = np.frombuffer(lzf.compress(content), np.uint8)  # read-only, as in a file
         out = np.zeros(len(content), np.uint8)
         assert expand(packed, out) == len(content)
         assert out.tobytes() == content
         assert expand(packed[: packed.size // 2], out) < len(content)
         assert expand(packed, out[:100]) <= 100
-    assert expand(np.array([0x20, 0x00, 5], np.uint8), out) == 0  # a copy from before the start
+    assert expand(np.frombuffer(b"\x20\x00\x05", np.uint8), out) == 0  # a copy from before the start
 
 
 def test_slots_of_velodyne_packets_become_packed_returns() -> None:

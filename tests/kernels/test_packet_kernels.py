@@ -7,6 +7,7 @@ import struct
 import lzf
 import numpy as np
 
+from roadscan.compute.kernel_options import read_only
 from roadscan.formats.clouds.kernels.lzf import expand
 from roadscan.formats.lidars.kernels.packets import (
     Firings,
@@ -135,7 +136,7 @@ def test_positions_are_those_of_the_manuals_formula() -> None:
         out = np.zeros((3, n), np.float32)
         turned = Turned(*np.zeros((4, SLOTS), np.float32))
         positions(
-            Packed(head, head_end, rate, rate_end, distance, slot), beams,
+            Packed(*map(read_only, (head, head_end, rate, rate_end, distance, slot))), beams,
             np.stack([np.sin(heads), np.cos(heads)]).astype(np.float32), turned, *out,
         )  # fmt: skip
         rows = np.arange(n)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.compute.kernels.arrays import BINS, bounds_of, copy_values, smallest, sort_few
+from roadscan.compute.kernels.arrays import BINS, bounds_of, copy_values, smallest, sort, sort_few
 from roadscan.compute.kernels.column_statistics import LANES
 from roadscan.compute.kernels.slots import SLOT_SIZE, VECTOR
 from roadscan.georeference.kernels.readings import FATES, KEPT
@@ -223,6 +223,9 @@ def test_order_statistics(n: int) -> None:
     assert bounds_of(values) == (values.min(), values.max())
     for k in {0, n // 2, n - 1}:
         assert smallest(values.copy(), k, np.zeros(BINS, np.int32), np.zeros(n + 1, np.int32)) == np.sort(values)[k]
+    whole = values.astype(np.int64)
+    sort(whole)
+    assert (whole == np.sort(values)).all()
     some = values[:20].copy()
     sort_few(some)
     assert some.tolist() == sorted(values[:20])

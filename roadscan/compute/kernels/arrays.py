@@ -159,7 +159,7 @@ def median(values):
     return (low + high) / 2.0
 
 
-@inner
+@kernel
 def sort(values):
     """Sort numbers (n,) in place, none of them NaN (Hoare, 1961, algorithm 64)."""
     waiting, many = np.empty((64, 2), np.int64), 0  # the longer part of each split: at most log2(n) of them

@@ -154,7 +154,7 @@ if KNOWN:
             compile_for: Callable[..., Any] = find_decorator(template)
             return lambda **given: compile_for(**{**given, "no_cfunc_wrapper": True, "pipeline_class": _PartCompiler})
 
-        _OverloadFunctionTemplate._get_jit_decorator = decorator  # type: ignore[method-assign]
+        _OverloadFunctionTemplate._get_jit_decorator = decorator
 
     def _keep_answers_of_types() -> None:
         """Cache the signature that a Numba function resolves for argument types, under the current options."""

@@ -390,7 +390,7 @@ def walk_cells(
         leave = min(max(min(to_x, to_y), r), end)
         index = (tile * TILE_CELLS + j) * TILE_CELLS + i
         for m in range(cells.first[index], cells.first[index + 1]):
-            member = np.int64(cells.members[m])
+            member = int(np.int64(cells.members[m]))
             found = meet(world.bodies, member, beam[0, 0], beam[1, 0], beam[2, 0], dx, dy, dz, key)
             if found < state[BEST]:
                 state[BEST], state[HIT] = found, member

@@ -7,7 +7,8 @@ Eight files of kernels write instructions of LLVM with the names that they impor
 Of a Numba whose internals were read (``KNOWN``), four things are changed, for this process:
 
 - Functions that only compiled functions call are stored as LLVM's bitcode. Numba would optimise each of them by itself
-  and generate machine code that nothing runs: their callers link the bitcode and are optimised with it.
+  and generate machine code that nothing runs: their callers link the bitcode and are optimised with it. The same holds
+  for the functions by which Numba stands in for NumPy's and Python's (`np.empty`, `max`, the pieces of a sort).
 - Each compilation has a unique number in the names of its machine code, whichever process it ran in. Numba counts from
   1 in every process, so that two functions of one name and signature (the variants that a factory makes) may get one
   name in two processes; a third that loads both from the cache would silently call one of them for the other
@@ -92,6 +93,7 @@ if KNOWN:
     from numba.core.registry import CPUDispatcher
     from numba.core.targetconfig import ConfigStack
     from numba.core.types.functions import BaseFunction
+    from numba.core.typing.templates import _OverloadFunctionTemplate
 
     class _Part(CPUDispatcher):  # type: ignore[misc]
         """A piece of compiled functions. A Python call would end the process, since it has no entry for one."""
@@ -144,6 +146,16 @@ if KNOWN:
 
         JITCPUCodegen.unserialize_library = read
 
+    def _link_what_numba_brings() -> None:
+        """Make the functions by which Numba stands in for NumPy's and Python's bitcode, too."""
+        find_decorator = _OverloadFunctionTemplate._get_jit_decorator
+
+        def decorator(template: Any) -> Callable[..., Any]:
+            compile_for: Callable[..., Any] = find_decorator(template)
+            return lambda **given: compile_for(**{**given, "no_cfunc_wrapper": True, "pipeline_class": _PartCompiler})
+
+        _OverloadFunctionTemplate._get_jit_decorator = decorator
+
     def _keep_answers_of_types() -> None:
         """Cache the signature that a Numba function resolves for argument types, under the current options."""
         find_signature: Callable[..., Any] = BaseFunction.get_call_type
@@ -160,6 +172,7 @@ if KNOWN:
         BaseFunction.get_call_type = kept  # type: ignore[method-assign, assignment]
 
     _read_parts_as_bitcode()
+    _link_what_numba_brings()
     _keep_answers_of_types()
 
 PART: Any = _Part if KNOWN else None

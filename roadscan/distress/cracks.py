@@ -307,7 +307,7 @@ def _valley_sections(heights: Float64, cells: ValleyCells, window: HeightWindow,
 
 def _valley_cells(found: CrackResponse) -> ValleyCells:
     """Returns all cells of the skeleton, also those pruned later: what is pruned depends on cells far away."""
-    row, column = np.nonzero(found.skeleton)
+    row, column = map(np.ascontiguousarray, np.nonzero(found.skeleton))
     angle = found.direction[row, column] * (np.pi / DIRECTIONS)
     flank = np.maximum(found.flank[row, column], 2).astype(np.int64)
     return ValleyCells(row, column, np.sin(angle), np.cos(angle), flank)

@@ -304,7 +304,8 @@ class Placement:
 def mirror_profiles(geometry: ScanGeometry, epochs_gps_ns: Int64, ranges: npt.NDArray[np.uint16]) -> MirrorProfiles:
     """Return profiles (n,) of a rotating mirror in the form that kernels take; ranges: (n, m) raw."""
     scale = geometry.range_offset_m, geometry.range_step_m
-    return MirrorProfiles(epochs_gps_ns, ranges, *geometry.rays(), scale, geometry.reading_period_ns)
+    epochs, raw = read_only(epochs_gps_ns), read_only(ranges)
+    return MirrorProfiles(epochs, raw, *geometry.rays(), scale, geometry.reading_period_ns)
 
 
 @dataclass(frozen=True)

@@ -173,7 +173,7 @@ class _Lines:
 
     def supported(self, heights: Float64, detail: Bool) -> Float64:
         """Returns heights (n,) of the cells on detail, each over the support of least risk."""
-        row, column = np.nonzero(detail)
+        row, column = map(np.ascontiguousarray, np.nonzero(detail))
         middle, sigma_m = self.median_m[detail], self.config.sigma_m
         with np.errstate(invalid="ignore"):
             outlier = np.abs(heights - self.median_m) > self.config.outlier_sigmas * sigma_m

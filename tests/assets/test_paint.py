@@ -96,6 +96,7 @@ def test_markings_of_simulated_streets(one: Callable[[], SimulatedStreet]) -> No
     assert f1_of_cells(scene, worn.on_paint, on_ground(scene)) >= 0.85
 
 
+@pytest.mark.slow
 def test_lines_of_the_highway_have_their_type_width_and_place() -> None:
     known = highway()
     lines = found(calibrated(known.scene), "lane_line")[1]

@@ -67,7 +67,7 @@ def test_heights_of_cells(points: np.ndarray) -> None:
     chosen = np.arange(h.size) % 3 > 0
     middle, half = np.full((ROWS, COLUMNS), 0.1, np.float32), np.full((ROWS, COLUMNS), 0.3, np.float32)
     sums = np.zeros((ROWS, COLUMNS, 3))
-    cell_heights(points[0], points[1], h, chosen, ORIGIN, 1 / CELL_M, middle, half, sums)
+    cell_heights(*points[:2].copy(), h, chosen, ORIGIN, 1 / CELL_M, middle, half, sums)
     d = h.astype(float) - np.float64(np.float32(0.1))
     used = chosen & (np.abs(d) <= np.float32(0.3))
     for column in range(3):

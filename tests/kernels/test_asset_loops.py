@@ -94,8 +94,9 @@ def test_contrasts_are_those_to_a_surface_between_cells() -> None:
 
 def test_sums_of_paint_are_those_of_its_cells() -> None:
     cell = np.array([0, 2, 2])
-    sums = np.zeros((3, 5))
-    paint_sums(cell, np.array([0.5, 1.0, 2.0]), np.array([0.1, 0.2, 0.3]), np.array([1.0, 2.0, 3.0]), sums)
+    sums = np.zeros((3, 5), np.float32)
+    heights = np.array([1.0, 2.0, 3.0], np.float32)
+    paint_sums(cell, np.array([0.5, 1.0, 2.0]), np.array([0.1, 0.2, 0.3]), heights, sums)
     assert sums[0] == pytest.approx([1.0, 0.5, 0.01, 1.0, 1.0])
     assert sums[1].tolist() == [0.0] * 5
     assert sums[2] == pytest.approx([2.0, 3.0, 0.13, 5.0, 13.0])
@@ -113,9 +114,9 @@ def test_least_heights_over_a_disk_are_those_of_scipy() -> None:
 
 
 def test_returns_on_the_ground_are_those_met_steeply() -> None:
-    place = tuple(map(np.array, ([5.0, 5.0, 5.0, 10.0, 5.0, 5.0], [0.0] * 6, [0.0] * 6)))
+    place = tuple(read_only(np.array(v)) for v in ([5.0, 5.0, 5.0, 10.0, 5.0, 5.0], [0.0] * 6, [0.0] * 6))
     up = np.array([2.0, 2.0, 0.4, 2.0, np.nan, 2.0])  # sines 0.37, 0.37, 0.08 (flat), beyond the box, not known, 0.37
-    sensor = (np.zeros(6), np.zeros(6), up)
+    sensor = tuple(map(read_only, (np.zeros(6), np.zeros(6), up)))
     above = np.array([0.05, 0.2, 0.0, 0.0, -0.1, 0.0], np.float32)  # the second one lies too high
     wanted, rows = np.array([True] * 5 + [False]), np.empty(6, np.int64)
     count = seen_on_ground(place, sensor, above, wanted, (0.11, 0.1), (0.0, 0.0, 10.0, 1.0), rows)
@@ -123,7 +124,7 @@ def test_returns_on_the_ground_are_those_met_steeply() -> None:
 
 
 def test_a_scan_line_is_one_laser_within_a_step_of_time() -> None:
-    epoch = np.array([5, 19, 21, -3, 5, 5], np.int64)
+    epoch = read_only(np.array([5, 19, 21, -3, 5, 5], np.int64))
     sensor, laser = np.array([0, 0, 0, 0, 1, 0], np.uint8), np.array([3, 3, 3, 3, 3, 4], np.uint16)
     out = np.empty(5, np.int64)
     scan_lines(np.array([0, 1, 2, 4, 5]), epoch, sensor, laser, 20, out)

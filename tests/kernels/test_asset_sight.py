@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from roadscan.assets.kernels.sight import Places, Rays, follow_rays, rays_at_shafts, rays_near
+from roadscan.compute.kernel_options import read_only
 
 CELL_M = 0.5
 BANDS_M = np.array([-0.3, 0.5, 1.5, 3.0])
@@ -98,7 +99,7 @@ def test_rays_at_leaning_shafts_are_those_that_numpy_counts() -> None:
     ])  # fmt: skip
     reach_m, limits = 6.0, (0.6, 0.15, 0.3, 0.1, 0.4)
     middle, before, behind, least, most = limits
-    rays = Rays(*np.ascontiguousarray(np.hstack([starts, ends]).T))
+    rays = Rays(*map(read_only, np.ascontiguousarray(np.hstack([starts, ends]).T)))
     cell_m, edge = 3.0, 10  # each shaft is listed for all cells: the list may hold more than is near
     cells = np.arange(edge * edge + 1) * len(shafts), np.tile(np.arange(len(shafts)), edge * edge), edge, edge
     counts = np.zeros((len(shafts), 3, 2), np.int64)

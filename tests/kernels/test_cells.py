@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from roadscan.compute.kernels.arrays import BINS, bounds_of, copy_values, smallest, sort_few
+from roadscan.compute.kernels.arrays import BINS, bounds_of, copy_values, smallest, sort, sort_few
 from roadscan.compute.kernels.column_statistics import LANES
 from roadscan.compute.kernels.slots import SLOT_SIZE, VECTOR
 from roadscan.georeference.kernels.readings import FATES, KEPT
@@ -146,7 +146,9 @@ def test_a_streak_is_counted_once_and_others_lie_outside() -> None:
     column = np.array([3] * 20 + [EDGE] * 4, np.int32)
     readings = Heights(column, np.full(24, 2, np.int32), np.full(24 + VECTOR, 50, np.int32))
     work = work_arrays(1)
-    assert accumulate(readings, (50, 50), np.full(24, 2, np.uint8), np.uint32(257), 1, work, active, pool) == 20
+    assert (
+        accumulate(readings, (50, 50), np.full(24, 2, np.uint8), np.uint32(257), np.int32(1), work, active, pool) == 20
+    )
     assert work.touched.tolist() == [1]
     columns, count = finished(active, pool)
     assert (count, columns.readings[0], columns.intensity_mean[0], columns.pass_ids[0]) == (1, 20, 514.0, 9)
@@ -176,7 +178,7 @@ def test_buckets_hand_out_what_was_put_in(way: str) -> None:
     for number in (0, 1):
         own = passes == number
         at = (a[own] for a in ((x // CELL).astype(np.int32), (y // CELL).astype(np.int32), height, intensity))
-        put_in_own_buckets(*at, number, ends, buckets)
+        put_in_own_buckets(*at, np.int32(number), ends, buckets)
     total, most = sizes_of_rows(ends, buckets.before, buckets.sizes)
     assert (total, most) == (x.size, np.bincount(y // CELL).max())
     if way == "statistics":
@@ -198,9 +200,9 @@ def test_buckets_hand_out_what_was_put_in(way: str) -> None:
 def test_a_row_gives_its_blocks_back() -> None:
     buckets, ends = empty_buckets(), np.zeros(EDGE, np.int32)
     many = np.zeros(3 * BLOCK + 1, np.int32)
-    put_in_own_buckets(many, many, many, many.astype(np.uint16), 0, ends, buckets)
+    put_in_own_buckets(many, many, many, many.astype(np.uint16), np.int32(0), ends, buckets)
     assert buckets.held[TAKEN] == 4
-    free_row(int(ends[0]), buckets)
+    free_row(ends[0], buckets)
     assert buckets.held[TAKEN] == 0 and sorted(buckets.free) == list(range(200))
 
 
@@ -221,6 +223,9 @@ def test_order_statistics(n: int) -> None:
     assert bounds_of(values) == (values.min(), values.max())
     for k in {0, n // 2, n - 1}:
         assert smallest(values.copy(), k, np.zeros(BINS, np.int32), np.zeros(n + 1, np.int32)) == np.sort(values)[k]
+    whole = values.astype(np.int64)
+    sort(whole)
+    assert (whole == np.sort(values)).all()
     some = values[:20].copy()
     sort_few(some)
     assert some.tolist() == sorted(values[:20])

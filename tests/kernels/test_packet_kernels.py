@@ -7,6 +7,7 @@ import struct
 import lzf
 import numpy as np
 
+from roadscan.compute.kernel_options import read_only
 from roadscan.formats.clouds.kernels.lzf import expand
 from roadscan.formats.lidars.kernels.packets import (
     Firings,
@@ -79,13 +80,13 @@ def test_pixels_become_returns_along_their_beams() -> None:
 def test_lzf_expands_what_liblzf_compressed() -> None:
     random = np.random.default_rng(1)
     for content in (b"a" * 1_000, bytes(random.integers(0, 4, 2_000, dtype="u1")), b"abcabcabcabd" * 40):
-        packed = np.frombuffer(lzf.compress(content), np.uint8)
+        packed = np.frombuffer(lzf.compress(content), np.uint8)  # read-only, as in a file
         out = np.zeros(len(content), np.uint8)
         assert expand(packed, out) == len(content)
         assert out.tobytes() == content
         assert expand(packed[: packed.size // 2], out) < len(content)
         assert expand(packed, out[:100]) <= 100
-    assert expand(np.array([0x20, 0x00, 5], np.uint8), out) == 0  # a copy from before the start
+    assert expand(np.frombuffer(b"\x20\x00\x05", np.uint8), out) == 0  # a copy from before the start
 
 
 def test_slots_of_velodyne_packets_become_packed_returns() -> None:
@@ -135,7 +136,7 @@ def test_positions_are_those_of_the_manuals_formula() -> None:
         out = np.zeros((3, n), np.float32)
         turned = Turned(*np.zeros((4, SLOTS), np.float32))
         positions(
-            Packed(head, head_end, rate, rate_end, distance, slot), beams,
+            Packed(*map(read_only, (head, head_end, rate, rate_end, distance, slot))), beams,
             np.stack([np.sin(heads), np.cos(heads)]).astype(np.float32), turned, *out,
         )  # fmt: skip
         rows = np.arange(n)

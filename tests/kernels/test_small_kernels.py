@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from roadscan.calibrate.kernels.surface_patches import place, splat
 from roadscan.calibrate.kernels.ties import SIDE, tie_residuals, tie_rows
+from roadscan.compute.kernel_options import read_only
 from roadscan.compute.kernels.arrays import range_bounds
 from roadscan.compute.kernels.curved_grid import accumulate_curved, thin_path
 from roadscan.distress.kernels.crack_response import add_bend, deepen, fill_holes, line_sums, thin
@@ -314,6 +315,6 @@ def test_places_between_ticks_are_linear() -> None:
     number = np.array([0, 1, 2, 2, 3, 4])  # no epoch needs tick 73
     epochs = np.array([700, 705, 710, 719, 749, 740], np.int64)
     found = np.empty((3, epochs.size))
-    between_ticks(epochs, 10, 70, number, at, found)
+    between_ticks(read_only(epochs), 10, 70, number, at, found)
     for axis in range(3):
         np.testing.assert_allclose(found[axis], np.interp(epochs, [700, 710, 720, 740, 750], at[:, axis]))

@@ -55,7 +55,7 @@ def test_fit_finds_a_strip_that_was_drawn(down, slope, axis, width):
     values = (0.4 - depth * share).astype(np.float32)
     values[rng.random(shape) < 0.1] = np.inf
     found = np.empty((1, FIELDS))
-    padded = np.pad(values, HALF_CUT, constant_values=np.inf)
+    padded = np.ascontiguousarray(np.pad(values, HALF_CUT, constant_values=np.inf))
     row, column = (np.array([v]) for v in centre)
     begin = np.array([slope + 0.15])
     fit_strips(padded, HALF_CUT, row, column, np.array([down]), begin, WIDTHS, 4.0, 5.0, 1e9, np.inf, found)

@@ -276,7 +276,7 @@ def test_heights_by_support_like_least_squares(share):
     pairs, onward = detail_pairs(), lines_onward()
     off, own = np.empty((5, 6), np.float32), np.empty((5, 6), np.float32)
     middle, direction = np.linspace(-1, 1, 5), np.arange(5, dtype=np.uint8)
-    cells = CrackCells(row, column, middle, np.full(5, 0.5), direction)
+    cells = CrackCells(row, column, middle, np.full(5, 0.5, np.float32), direction)
     heights_by_support(values, 6, cells, 0.25, Shapes(onward, pairs), np.inf, off, own)
     for t in range(5):
         i, j = row[t] + 6, column[t] + 6

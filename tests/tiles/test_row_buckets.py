@@ -53,7 +53,8 @@ def fill(accumulator: Accumulator, p: TilePoints, tile: TileId, fates: Any, clas
                 return start
             own = slice(start, start + AT_ONCE)
             placed = Georeferenced(east[own], north[own], height[own], kinds[own], intervals[own])
-            measured = Measured(p.epoch_gps_ns[own], numbers[own], p.intensity[own], np.uint32(1), sigmas)
+            epochs, light = p.epoch_gps_ns[own].copy(), p.intensity[own].copy()
+            measured = Measured(epochs, numbers[own], light, np.uint32(1), sigmas)
             work = [np.empty(AT_ONCE, np.int32) for _ in range(3)]
             places = Places(*work, np.full(len(accumulator.spans), -1, np.int32))
             fill_buckets(placed, measured, places, active, buckets, fates)

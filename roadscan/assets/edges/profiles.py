@@ -226,7 +226,7 @@ def _fitted(
     row, column = raster.cells_of(line[:, 0], line[:, 1])
     gx, gy = slopes[0][row, column], slopes[1][row, column]
     level = _level(raster, row, column)
-    node = np.column_stack([line, ux, uy, level, gx * ux + gy * uy, gx * uy - gy * ux])
+    node = np.ascontiguousarray(np.column_stack([line, ux, uy, level, gx * ux + gy * uy, gx * uy - gy * ux]))
     out = np.empty((len(line), kernel.RESULTS))
     kernel.fit_nodes(node, *heights, ALONG_M, SEARCH, PRIOR, out)
     return out, level

@@ -42,7 +42,9 @@ def sort_groups(key, begins, order):
     """Compute the order (n,) int64 of items by their key (n,) int64 within each group, which begins (groups + 1,)."""
     for g in range(begins.size - 1):
         first, end = begins[g], begins[g + 1]
-        order[first:end] = first + np.argsort(key[first:end])
+        own = np.argsort(key[first:end])
+        for k in range(own.size):
+            order[first + k] = first + own[k]
 
 
 @kernel

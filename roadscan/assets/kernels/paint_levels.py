@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from roadscan.compute.kernel_options import inlined, kernel
+from roadscan.compute.kernels.arrays import sort
 
 MOST_OF_A_CELL = 16
 """Readings of a cell that are used; of more, an even choice."""
@@ -150,7 +151,8 @@ def distinct_in_groups(starts, order, value, out):
     starts : (groups + 1,) where the things of each group begin in `order`. value : (n,) int64 of each thing.
     """
     for group in range(out.size):
-        own = np.sort(value[order[starts[group] : starts[group + 1]]])
+        own = value[order[starts[group] : starts[group + 1]]]
+        sort(own)
         found = 0
         for k in range(own.size):
             found += 1 if k == 0 or own[k] != own[k - 1] else 0

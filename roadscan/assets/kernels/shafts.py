@@ -9,30 +9,41 @@ import numpy as np
 
 from roadscan.assets import classes
 from roadscan.compute.kernel_options import inlined, inner, kernel
-from roadscan.compute.kernels.arrays import sorted_quantile
+from roadscan.compute.kernels.arrays import median, sort, sorted_quantile
 
 REACHES_M = (0.3, 0.2, 0.15)
 """Components this near to the axis (m) belong to it, round after round."""
 
 
 @inlined
+def _mean(v):
+    """Returns the mean of v (n,)."""
+    total = 0.0
+    for k in range(v.size):
+        total += v[k]
+    return total / v.size
+
+
+@inlined
 def _slope(t, v):
     """Returns the slope of v (n,) over t (n,), whose mean is 0."""
-    mean, total, squares = v.mean(), 0.0, 0.0
+    mean, total, squares = _mean(v), 0.0, 0.0
     for k in range(t.size):
         total += t[k] * (v[k] - mean)
         squares += t[k] * t[k]
     return total / max(squares, 1e-9)
 
 
-@inlined
-def _distinct(level):
-    """Returns how many numbers occur in level (n,)."""
-    held = np.sort(level)
-    found = 1 if held.size else 0
-    for k in range(1, held.size):
-        found += 1 if held[k] != held[k - 1] else 0
-    return found
+@inner
+def _distinct(level, kept):
+    """Returns the numbers (k,) that occur in level (n,) where `kept` is true, ascending."""
+    some, found = level[kept], 0
+    sort(some)
+    for k in range(some.size):
+        if k == 0 or some[k] != some[k - 1]:
+            some[found] = some[k]
+            found += 1
+    return some[:found]
 
 
 @kernel
@@ -45,18 +56,22 @@ def near_axis(x, y, level, seed, most_lean, kept):
     kept[:] = True
     ax, ay, bx, by = seed[0], seed[1], 0.0, 0.0
     for reach in REACHES_M:
-        own = level[kept].astype(np.float64)
-        if own.size == 0:
+        past, across, along = level[kept].astype(np.float64), x[kept], y[kept]
+        if past.size == 0:
             return
-        middle = own.mean()
-        if _distinct(own) >= 4:
-            bx = min(max(_slope(own - middle, x[kept]), -most_lean), most_lean)
-            by = min(max(_slope(own - middle, y[kept]), -most_lean), most_lean)
-        ax = np.median(x[kept] - bx * (own - middle))
-        ay = np.median(y[kept] - by * (own - middle))
+        middle = _mean(past)
+        for k in range(past.size):
+            past[k] -= middle
+        if _distinct(level, kept).size >= 4:
+            bx = min(max(_slope(past, across), -most_lean), most_lean)
+            by = min(max(_slope(past, along), -most_lean), most_lean)
+        for k in range(past.size):
+            across[k] -= bx * past[k]
+            along[k] -= by * past[k]
+        ax, ay = median(across), median(along)
         for k in range(x.size):
-            past = level[k] - middle
-            kept[k] = math.hypot(x[k] - ax - bx * past, y[k] - ay - by * past) <= reach
+            away = level[k] - middle
+            kept[k] = math.hypot(x[k] - ax - bx * away, y[k] - ay - by * away) <= reach
 
 
 @kernel
@@ -65,7 +80,7 @@ def longest_run(level, gap, least, kept):
 
     level : (n,) int64; gap : greatest step from a level to the next of a run; least : shorter runs keep none.
     """
-    held = np.unique(level[kept])
+    held = _distinct(level, kept)
     best, first, begin = 0, 0, 0
     for k in range(held.size + 1):
         if k == held.size or (k > 0 and held[k] - held[k - 1] > gap):
@@ -83,19 +98,21 @@ def widths_of_levels(xyh, level, least, shares, widths):
     xyh : (n, 3) returns (m); level : (n,) int64; least : number of returns; shares : (2,) of those below the box and
     below its end, along x and y each.
     """
-    order = np.argsort(level, kind="mergesort")
-    first = 0
-    while first < order.size:
-        end = first + 1
-        while end < order.size and level[order[end]] == level[order[first]]:
-            end += 1
-        if end - first >= least:
-            x, y = np.sort(xyh[order[first:end], 0]), np.sort(xyh[order[first:end], 1])
-            across = sorted_quantile(x, shares[1]) - sorted_quantile(x, shares[0])
-            widths[level[order[first]]] = math.hypot(
-                across, sorted_quantile(y, shares[1]) - sorted_quantile(y, shares[0])
-            )
-        first = end
+    count, x, y = np.zeros(widths.size, np.int64), np.empty(level.size), np.empty(level.size)
+    for i in range(level.size):
+        count[level[i]] += 1
+    for k in range(widths.size):
+        if count[k] == 0 or count[k] < least:
+            continue
+        many = 0
+        for i in range(level.size):
+            if level[i] == k:
+                x[many], y[many] = xyh[i, 0], xyh[i, 1]
+                many += 1
+        sort(x[:many])
+        sort(y[:many])
+        across = sorted_quantile(x[:many], shares[1]) - sorted_quantile(x[:many], shares[0])
+        widths[k] = math.hypot(across, sorted_quantile(y[:many], shares[1]) - sorted_quantile(y[:many], shares[0]))
 
 
 @kernel
@@ -192,8 +209,8 @@ def about_shaft(returns, near, axis, heights, edges, slot_ns, number, sectors, o
 @inner
 def _distinct_of_both(own, other):
     """Returns how many numbers occur in `own`, and how many more in `other`; both are sorted."""
-    own.sort()
-    other.sort()
+    sort(own)
+    sort(other)
     first, second, k = 0, 0, 0
     for i in range(own.size):
         first += i == 0 or own[i] != own[i - 1]
@@ -296,7 +313,12 @@ def radius_across(across, kept, sector):
                 held += 1
             last += 1
         if held >= _LEAST_OF_SECTOR:
-            widths[found], weights[found] = _width(np.sort(buffer[:held])), held
+            sort(buffer[:held])
+            width, k = _width(buffer[:held]), found
+            while k > 0 and widths[k - 1] > width:
+                widths[k], weights[k] = widths[k - 1], weights[k - 1]
+                k -= 1
+            widths[k], weights[k] = width, held
             found += 1
         first = last
     if found == 0:
@@ -305,15 +327,15 @@ def radius_across(across, kept, sector):
             if kept[i] > 0.0:
                 buffer[held] = across[i]
                 held += 1
-        widths[0], weights[0], found = _width(np.sort(buffer[:held])), 1.0, 1
-    order = np.argsort(widths[:found], kind="mergesort")
-    total = weights[:found].sum()
-    reached = 0.0
-    middle = widths[order[found - 1]]
+        sort(buffer[:held])
+        widths[0], weights[0], found = _width(buffer[:held]), 1.0, 1
+    total, reached, middle = 0.0, 0.0, widths[found - 1]
     for k in range(found):
-        reached += weights[order[k]]
+        total += weights[k]
+    for k in range(found):
+        reached += weights[k]
         if reached >= 0.5 * total:
-            middle = widths[order[k]]
+            middle = widths[k]
             break
     return min(max(0.5 * middle / (1.0 - 2.0 * _INNER), LEAST_RADIUS_M), MOST_RADIUS_M)
 
@@ -324,11 +346,11 @@ def fit_cylinder(table, sector, lean, state, work):
 
     table : (n, 5) x, y, height past the middle, and the unit vector towards the sensor, seen from above; sector : (n,)
     int64 direction of that vector, ascending; lean : the axis may lean; state : (5,) x, y, slopes of both with height,
-    radius: where to begin, and what is found; work : (n, 4) working space.
+    radius: where to begin, and what is found; work : (n, 3) working space.
     """
     n = table.shape[0]
     normal, right = np.empty((4, 4)), np.empty(4)
-    a = np.empty(4)
+    a, away = np.empty(4), np.empty(n)
     total, square = float(n), 0.0
     for turn in range(_ROUNDS):
         radius = state[4]
@@ -341,7 +363,8 @@ def fit_cylinder(table, sector, lean, state, work):
             work[i, 2] = 1.0 if turn < 2 or math.hypot(dx, dy) < 2.0 * radius + 0.05 else 0.0
             total += work[i, 2]
         if total < 5.0:
-            work[:, 2] = 1.0
+            for i in range(n):
+                work[i, 2] = 1.0
             total = float(n)
         radius = radius_across(work[:, 0], work[:, 2], sector)
         state[4] = radius
@@ -350,9 +373,9 @@ def fit_cylinder(table, sector, lean, state, work):
             across = work[i, 0]
             work[i, 1] -= math.sqrt(max(radius * radius - across * across, 0.04 * radius * radius))
             if work[i, 2] > 0.0:
-                work[held, 3] = abs(work[i, 1])
+                away[held] = abs(work[i, 1])
                 held += 1
-        scale = 1.5 * max(np.median(work[:held, 3]), 0.005)
+        scale = 1.5 * max(median(away[:held]), 0.005)
         spread = max(radius / math.sqrt(3.0), 0.01)
         normal[:], right[:] = 0.0, 0.0
         square = 0.0
@@ -378,7 +401,10 @@ def fit_cylinder(table, sector, lean, state, work):
         normal[2, 2] += stiff
         normal[3, 3] += stiff
         move = np.linalg.solve(normal, right)
-        state[:4] += move
-        if np.abs(move).max() < 1e-5 and turn > 2:
+        largest = 0.0
+        for p in range(4):
+            state[p] += move[p]
+            largest = max(largest, abs(move[p]))
+        if largest < 1e-5 and turn > 2:
             break
     return math.sqrt(square / total), total

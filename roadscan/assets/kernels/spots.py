@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from roadscan.compute.kernel_options import inlined, inner, kernel
-from roadscan.compute.kernels.arrays import sorted_quantile
+from roadscan.compute.kernels.arrays import sort, sorted_quantile
 
 LANES = 8  # Returns of a cell whose neighbours are sought together.
 
@@ -43,8 +43,9 @@ def grow_spot(x, y, value, buckets, grid, place, limits, shares):
         return near, inside
     starts, order, cell = _in_cells(x, y, near, place, radius, smooth)
     side = round(math.sqrt(starts.size - 1))
-    u, v, w = np.empty(size + LANES), np.empty(size + LANES), value[near][order]
-    u[:size], v[:size] = x[near][order], y[near][order]
+    u, v, w = np.empty(size + LANES), np.empty(size + LANES), np.empty(size)
+    for n in range(size):
+        u[n], v[n], w[n] = x[near[order[n]]], y[near[order[n]]], value[near[order[n]]]
     mean, total, number = np.empty(size), np.empty(LANES), np.empty(LANES)
     for c in range(side + 1, starts.size - side - 2):
         for n in range(starts[c], starts[c + 1], LANES):
@@ -107,7 +108,8 @@ def _near(x, y, buckets, grid, place, radius):
             if u * u + v * v <= radius * radius:
                 near[count] = order[m]
                 count += 1
-    return np.sort(near[:count])
+    sort(near[:count])
+    return near[:count]
 
 
 @inner

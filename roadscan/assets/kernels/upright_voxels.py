@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from roadscan.compute.kernel_options import inlined, kernel
 
 
@@ -228,8 +226,7 @@ def region_ranges(region, members, starts):
         starts[region[j] + 1] += 1
     for k in range(1, starts.size):
         starts[k] += starts[k - 1]
-    at = np.empty(starts.size, np.int64)
-    at[:] = starts
+    at = starts.copy()
     for j in range(region.size):
         members[at[region[j]]] = j
         at[region[j]] += 1

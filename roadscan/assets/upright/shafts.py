@@ -81,7 +81,7 @@ def fit_axis(xyh: Float64, sensor_xy: Float64, *, lean: bool = True) -> Axis:
     order = np.argsort(sector, kind="stable")
     table = np.ascontiguousarray(np.column_stack([xyh[:, :2], xyh[:, 2] - middle, sight])[order])
     state = np.array([median(xyh[:, 0]), median(xyh[:, 1]), 0.0, 0.0, 0.03])
-    residual, _ = fit_cylinder(table, sector[order], lean, state, np.empty((len(table), 4)))
+    residual, _ = fit_cylinder(table, sector[order], lean, state, np.empty((len(table), 3)))
     x, y, slope_x, slope_y, radius = map(float, state)
     return Axis(x, y, middle, slope_x, slope_y, radius, float(residual))
 

@@ -162,8 +162,8 @@ def match_patches(first, second, cell, corner, size, step, iterations, least, fo
     move = np.empty(UNKNOWNS)
     right = np.empty(UNKNOWNS)
     for p in range(corner.shape[0]):
-        move[:3] = shift[p]
-        move[3:] = 0.0
+        for k in range(UNKNOWNS):
+            move[k] = shift[p, k] if k < 3 else 0.0
         done = False
         for turn in range(iterations):
             crossed[p], mean[p], felt[p], right[:] = 0.0, 0.0, 0.0, 0.0
@@ -178,4 +178,5 @@ def match_patches(first, second, cell, corner, size, step, iterations, least, fo
             reach = math.hypot(change[0], change[1]) / cell
             move += min(1.0, LONGEST_CELLS / max(reach, 1e-300)) * change
             done = reach < DONE_CELLS
-        shift[p] = move[:3]
+        for k in range(3):
+            shift[p, k] = move[k]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from roadscan.compute.kernel_options import bare, bare_inner, inlined, kernel
+from roadscan.compute.kernel_options import bare, bare_inner, inlined, inner, kernel
 
 
 @bare
@@ -119,6 +119,73 @@ def smallest(values, k, bins, found):
         values, k = values[:n], k - before
     sort_few(values)
     return np.int64(values[k])
+
+
+@inner
+def selected(values, k):
+    """Return the k-th smallest (from 0) of (n,) float64, which change places (Hoare, 1961, algorithm 65).
+
+    NumPy's median and sorts compile for a second in each kernel that calls them.
+    """
+    low, high = 0, values.size - 1
+    while low < high:
+        pivot, i, j = values[k], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while pivot < values[j]:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if j < k:
+            low = i
+        if k < i:
+            high = j
+    return values[k]
+
+
+@inner
+def median(values):
+    """Return the median of (n,) float64, n > 0, which change places."""
+    half = values.size // 2
+    high = selected(values, half)
+    if values.size % 2 == 1:
+        return high
+    low = values[0]
+    for k in range(1, half):
+        low = max(low, values[k])
+    return (low + high) / 2.0
+
+
+@kernel
+def sort(values):
+    """Sort numbers (n,) in place, none of them NaN (Hoare, 1961, algorithm 64)."""
+    waiting, many = np.empty((64, 2), np.int64), 0  # the longer part of each split: at most log2(n) of them
+    low, high = 0, values.size - 1
+    while True:
+        if high - low < 16:  # left to insertion
+            if many == 0:
+                break
+            many -= 1
+            low, high = waiting[many, 0], waiting[many, 1]
+            continue
+        pivot, i, j = values[(low + high) // 2], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while pivot < values[j]:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        first = j - low < high - i
+        waiting[many, 0], waiting[many, 1] = (i, high) if first else (low, j)
+        low, high = (low, j) if first else (i, high)
+        many += 1
+    sort_few(values)
 
 
 @inlined

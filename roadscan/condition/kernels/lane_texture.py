@@ -11,7 +11,8 @@ import math
 import numpy as np
 
 from roadscan.compute.kernel_options import inlined, inner, kernel
-from roadscan.condition.kernels.sampling import MOST_CELLS, Cells, factorise, gather, median, smallest, solve
+from roadscan.compute.kernels.arrays import median, selected
+from roadscan.condition.kernels.sampling import MOST_CELLS, Cells, factorise, gather, solve
 
 BLOCK_M = 0.05
 """Edge of a block, at least that of a cell (m)."""
@@ -212,7 +213,7 @@ def loss(found, count, base, half, blocks, sums, slopes, away):
         used += 1
     if used < 4 * blocks * blocks:
         return np.nan
-    return smallest(away[:used], int(SOUND * used)) - total / used
+    return selected(away[:used], int(SOUND * used)) - total / used
 
 
 @kernel

@@ -8,6 +8,7 @@ separate equation, whose solution over a step d is c ← exp(p·d)·(c + w·s) �
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -116,7 +117,10 @@ def _roll_piece(xs, hs, car, rules, squared, response_m, measured_m):
             same &= abs(steps[i] - step) < _SAME_STEP_M
         if not same:
             _grow(steps[:count], car, growth)
-            step = steps[0] if np.max(np.abs(steps - steps[0])) < _SAME_STEP_M else -1.0
+            step = steps[0]
+            for i in range(steps.size):
+                if not abs(steps[i] - steps[0]) < _SAME_STEP_M:
+                    step = -1.0
         for i in range(count):
             s, d, e1, e2 = slope[begin + i], steps[i], growth[i, 0], growth[i, 1]
             u, v = x1 + a1 * s, y1 + b1 * s
@@ -177,15 +181,21 @@ def roll(x_m, height_m, car, rules, squared, response_m, measured_m):
     measured_m : (profiles, n) float64, out: length rolled over from the first sample on (m).
     """
     for row in range(height_m.shape[0]):
-        there = np.isfinite(height_m[row])
-        m = np.count_nonzero(there)
+        m = 0
+        for i in range(x_m.size):
+            m += math.isfinite(height_m[row, i])
         if m == x_m.size:
             _roll_valid(x_m, height_m[row], car, rules, squared, response_m[row], measured_m[row])
         elif m == 0:
             response_m[row, :] = 0.0
             measured_m[row, :] = 0.0
         else:
-            xs, response, measured = x_m[there], np.empty(m), np.empty(m)
-            _roll_valid(xs, height_m[row][there], car, rules, squared, response, measured)
+            xs, hs, response, measured = np.empty(m), np.empty(m), np.empty(m), np.empty(m)
+            k = 0
+            for i in range(x_m.size):
+                if math.isfinite(height_m[row, i]):
+                    xs[k], hs[k] = x_m[i], height_m[row, i]
+                    k += 1
+            _roll_valid(xs, hs, car, rules, squared, response, measured)
             _to_all(x_m, xs, response, response_m[row])
             _to_all(x_m, xs, measured, measured_m[row])

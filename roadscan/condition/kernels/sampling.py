@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from roadscan.compute.arrays import SIGMA_OF_MAD
 from roadscan.compute.kernel_options import inlined, inner, kernel
+from roadscan.compute.kernels.arrays import median
 
 MOST_CELLS = 4096
 """Most cells of a window that are used; of a denser window those of its first rows."""
@@ -68,44 +69,6 @@ class Cells(NamedTuple):
     readings: npt.NDArray[np.float64]
     at: npt.NDArray[np.int64]
     """Their indices in the table."""
-
-
-@inner
-def smallest(values, k):
-    """Return the k-th smallest (from 0) of (n,) float64, which change places (Hoare, 1961, algorithm 65).
-
-    NumPy's median and partition compile for a second in each kernel that calls them.
-    """
-    low, high = 0, values.size - 1
-    while low < high:
-        pivot, i, j = values[k], low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while pivot < values[j]:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        if j < k:
-            low = i
-        if k < i:
-            high = j
-    return values[k]
-
-
-@inner
-def median(values):
-    """Return the median of (n,) float64, n > 0, which change places."""
-    half = values.size // 2
-    high = smallest(values, half)
-    if values.size % 2 == 1:
-        return high
-    low = values[0]
-    for k in range(1, half):
-        low = max(low, values[k])
-    return (low + high) / 2.0
 
 
 @inlined
@@ -281,7 +244,8 @@ def sigma(found, count, size, away, told):
         return np.nan
     freedom = weights
     for j in range(told):
-        column[:] = squared[:, j]
+        for i in range(TERMS):
+            column[i] = squared[i, j]
         solve(factor, told, column, row)
         freedom -= row[j]
     if freedom < LEAST_FREEDOM * weights:

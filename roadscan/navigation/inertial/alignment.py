@@ -174,8 +174,9 @@ class _Motion:
         bounds = merged(imu.epochs_gps_ns, epochs)
         count = bounds.size - 1
         steps, turn, push = np.empty(count), np.empty((count, 3)), np.empty((count, 3))
-        rate = imu.angular_rate_rad_per_s - bias
-        increments(imu.epochs_gps_ns, rate, imu.specific_force_m_per_s2, instant, bounds, steps, turn, push)
+        rate, force = imu.angular_rate_rad_per_s - bias, imu.specific_force_m_per_s2
+        rate, force = np.ascontiguousarray(rate), np.ascontiguousarray(force)
+        increments(imu.epochs_gps_ns, rate, force, instant, bounds, steps, turn, push)
         quaternions, felt = np.empty((count + 1, 4)), np.empty((count + 1, 3))
         turned_frame(turn, push, quaternions, felt)
         at = np.searchsorted(bounds, epochs)

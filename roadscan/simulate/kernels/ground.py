@@ -276,7 +276,7 @@ def first_ground(
     goes on beyond its edges.
     """
     plane = cells.plane
-    k = cells.node[index]
+    k = int(np.int64(cells.node[index]))
     x0, x1 = along_beam(beam, 0, begin) - middle_e, along_beam(beam, 0, end) - middle_e
     y0, y1 = along_beam(beam, 1, begin) - middle_n, along_beam(beam, 1, end) - middle_n
     east, north, room, bend = plane[index, 1], plane[index, 2], plane[index, 3], plane[index, 4]

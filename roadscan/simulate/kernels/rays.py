@@ -254,17 +254,16 @@ def cast(
         stop_in_grass(world.road, beam, key, state)
     if hit >= 0:
         still = world.bodies.shape[0]
+        rows, i, own = world.bodies, hit, key
         if hit >= still:
             place_mover(movers, time_s, hit - still, body)
+            rows, i, own = body, 0, key ^ np.uint64(hit)
         r = state[BEST]
         for _ in range(2):
             tx, ox = beam[0, 1] + 2.0 * r * beam[0, 2], beam[0, 0] - r * r * beam[0, 2]
             ty, oy = beam[1, 1] + 2.0 * r * beam[1, 2], beam[1, 0] - r * r * beam[1, 2]
             tz, oz = beam[2, 1] + 2.0 * r * beam[2, 2], beam[2, 0] - r * r * beam[2, 2]
-            if hit >= still:
-                again = meet(body, 0, ox, oy, oz, tx, ty, tz, key ^ np.uint64(hit))
-            else:
-                again = meet(world.bodies, hit, ox, oy, oz, tx, ty, tz, key)
+            again = meet(rows, i, ox, oy, oz, tx, ty, tz, own)
             if abs(again - r) < 0.05:
                 r = again
         state[BEST] = r
@@ -391,9 +390,10 @@ def walk_cells(
         leave = min(max(min(to_x, to_y), r), end)
         index = (tile * TILE_CELLS + j) * TILE_CELLS + i
         for m in range(cells.first[index], cells.first[index + 1]):
-            found = meet(world.bodies, cells.members[m], beam[0, 0], beam[1, 0], beam[2, 0], dx, dy, dz, key)
+            member = int(np.int64(cells.members[m]))
+            found = meet(world.bodies, member, beam[0, 0], beam[1, 0], beam[2, 0], dx, dy, dz, key)
             if found < state[BEST]:
-                state[BEST], state[HIT] = found, cells.members[m]
+                state[BEST], state[HIT] = found, member
         if cells.flags[index] and leave > r:
             meet_ground(world, index, corner_e + i * CELL_M, corner_n + j * CELL_M, beam, r, leave, state)
         if to_x < to_y:

@@ -472,7 +472,7 @@ def survey_points(road: RoadArrays, easting: Float64, northing: Float64, near: I
     out : (n, 6) height without texture (NaN off the surface), station, offset, depth of defects, intensity, texture.
     """
     for i in range(easting.size):
-        k, u, offset = project(road, easting[i], northing[i], near[i])
+        k, u, offset = project(road, easting[i], northing[i], int(np.int64(near[i])))
         station = road.nodes[k, STATION] + u
         depth, _ = defect_depth(road, k, u, offset)
         known = on_surface(road, k, u, offset)

@@ -258,7 +258,8 @@ def evaluate(x, y, triangles, patches, node_x, node_y, cell_x, cell_y, heights):
     own_x, own_y, places, found = np.zeros(size), np.zeros(size), np.zeros(size, np.int64), np.zeros(size)
     edges, patches, heights = np.zeros(SCALE + 1), patches.reshape(-1), heights.reshape(-1)
     wide_x = np.zeros(columns + SHORT)
-    wide_x[:columns] = node_x
+    for k in range(columns):
+        wide_x[k] = node_x[k]
     for t in range(triangles.shape[0]):
         a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
         south, north = min(y[a], y[b], y[c]), max(y[a], y[b], y[c])

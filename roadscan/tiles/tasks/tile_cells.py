@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.compute.array_types import Int32, Int64
+from roadscan.compute.kernel_options import read_only
 from roadscan.core.errors import StoreError
 from roadscan.core.grid import LanePass, TileId
 from roadscan.core.rig import ScanGeometry
@@ -97,7 +98,7 @@ class Counting:
     ) -> None:
         """Count n returns; all arrays are (n,), `passes` as in :meth:`profiles`."""
         for rows, mounting in self.placement.mountings.pieces(pose_epochs_gps_ns):
-            returns = Returns(pose_epochs_gps_ns[rows], *(axis[rows] for axis in xyz_sensor_m))
+            returns = Returns(*(read_only(column[rows]) for column in (pose_epochs_gps_ns, *xyz_sensor_m)))
             measured = self._measured(epochs_gps_ns[rows], passes[rows], intensity[rows], _SIXTEEN_BITS)
             self._returns(returns, measured, self.placement.georeference(mounting))
 

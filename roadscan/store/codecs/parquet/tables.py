@@ -23,6 +23,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from roadscan.compute.kernel_options import read_only
 from roadscan.store.codecs.kernels.byte_planes import LONGEST_RUN_BYTES, encode_runs
 from roadscan.store.codecs.parquet import page_file
 from roadscan.store.codecs.parquet.page_file import (
@@ -180,7 +181,7 @@ class Writer:
         if self._words.size < (room := delta_packing.room_words(values.size)):
             self._words = np.empty(room, np.uint64)
         encode = wide_packing.encode if wide_packing.THERE else delta_packing.encode
-        return self._words.view(np.uint8)[: encode(values, self._words)]
+        return self._words.view(np.uint8)[: encode(read_only(values), self._words)]
 
     def pack(self, content: npt.NDArray[np.uint8]) -> Packed:
         """Return the content of a page under LZ4."""
@@ -418,7 +419,7 @@ class _Numbers(Writer):
 
         if self._room.size < room_words_long(values.size):
             self._room = np.empty(room_words_long(values.size), np.uint64)
-        packed = encode_long(np.ascontiguousarray(values), self._room)
+        packed = encode_long(read_only(np.ascontiguousarray(values)), self._room)
         if packed == TOO_FAR:
             return page_file.PLAIN, values.astype("<i8").view(np.uint8)
         head = varint(BLOCK) + varint(MINIBLOCKS) + varint(values.size) + zigzag(int(values[0]))
@@ -433,7 +434,7 @@ class _Numbers(Writer):
             self._planes = np.empty(width * values.size, np.uint8)
         planes = self._planes[: width * values.size]
         if step is None:
-            split(np.ascontiguousarray(values).view(f"u{values.itemsize}"), width, planes)
+            split(read_only(np.ascontiguousarray(values).view(f"u{values.itemsize}")), width, planes)
         else:
             line, number = np.empty(_SCRATCH, values.dtype), values.dtype.type
             split_rounded(values, number(1 / step), number(step), line, line.view(f"u{width}"), planes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -83,10 +84,13 @@ def drawn(seed: int, folder: Path) -> Path:
     return file
 
 
-def spoil(folder: Path, seed: int) -> None:
-    """Draw shadows of trees and houses on the ground of all pictures of a survey, and dirt on the lens."""
+def spoil(folder: Path, seed: int, more: Sequence[Float64] = (), blur_px: float = 1.0) -> None:
+    """Draw shadows of trees and houses on the ground of all pictures of a survey, and dirt on the lens.
+
+    more : outlines (n, 3) of further shadows; blur_px : 1 σ of the edges of all (pixels).
+    """
     known, random = truth.load(folder), np.random.default_rng([seed, 1])
-    shadows = [_shadow(random, known.surface, known.scene.length_m) for _ in range(9)]
+    shadows = [_shadow(random, known.surface, known.scene.length_m) for _ in range(9)] + list(more)
     camera = known.scene.camera
     size = camera.width_px, camera.height_px
     dirt = np.ones((size[1], size[0]), np.float32)
@@ -111,7 +115,7 @@ def spoil(folder: Path, seed: int) -> None:
                     continue
                 pixel = cv2.projectPoints(own, np.zeros(3), np.zeros(3), matrix, np.zeros(5))[0][:, 0]
                 cv2.fillPoly(shade, [np.clip(np.round(pixel * 8), -80000, 80000).astype(np.int32)], 1.0, shift=3)
-            shade = cv2.GaussianBlur(shade, (0, 0), 1.0)[..., None]
+            shade = cv2.GaussianBlur(shade, (0, 0), blur_px)[..., None]
             light = 1.0 - shade * (1.0 - _SHADE[::-1])
             # light is linear, digital numbers are its power of 1/2.2
             spoiled = picture * light ** (1 / 2.2) * dirt[..., None] + 70.0 * (1.0 - dirt[..., None])

@@ -104,7 +104,9 @@ class AssetKind(ABC):
     crown, a crosswalk, a fence's least length, and the surface behind a kerb with its slope."""
 
     sees_green: ClassVar[bool] = False
-    """Whether it uses the green ground of pictures (:meth:`with_green`)."""
+    """Whether it uses the green ground of pictures (:meth:`with_pictures`)."""
+    sees_paint: ClassVar[bool] = False
+    """Whether it uses the paint that pictures show, likewise."""
 
     @abstractmethod
     def evidence(self, scene: Scene, options: Any) -> Evidence:
@@ -119,8 +121,10 @@ class AssetKind(ABC):
         `pieces` come in the order of tiles (row, column); `others` holds the objects of the kinds named by `after`.
         """
 
-    def with_green(self, pieces: pa.Table, green: pa.Table) -> pa.Table:
-        """Returns pieces with what the green cells of pictures (`roadscan.assets.green.areas.GREEN_CELLS`) say."""
+    def with_pictures(self, pieces: pa.Table, shown: pa.Table) -> pa.Table:
+        """Returns pieces with what green cells (`roadscan.assets.green.areas.GREEN_CELLS`) or paint of pictures
+        (`roadscan.assets.tasks.pictured_paint.PAINTED`) say.
+        """
         return pieces
 
 

@@ -52,7 +52,7 @@ class Assets(Stage):
     )  # fmt: skip
     writes = (
         "intensity_samples", "intensity_gains", "scene_statistics", "asset_evidence", "asset_screens",
-        "asset_ground", "asset_green", "asset_visibility", "asset_objects",
+        "asset_ground", "asset_green", "asset_painted", "asset_visibility", "asset_objects",
         "classified_points", "bare_earth", "ground_sections", AssetKind,
     )  # fmt: skip
 
@@ -104,7 +104,7 @@ class Assets(Stage):
         session.failed(self.name, failures)
 
     def _look_at_ground(self, session: Session, plan: AssetPlan) -> None:
-        """Find green ground in the pictures, where there are any."""
+        """Find green ground and paint in the pictures, where there are any."""
         from roadscan.assets.tasks.green import find_green, green_tasks, plan_green
         from roadscan.condition.tasks.tasks import run_units
 
@@ -119,7 +119,7 @@ class Assets(Stage):
         if elsewhere:
             session.note(
                 f"assets: {len(elsewhere):,} pictures show the ground elsewhere than the lidar does and tell no green "
-                f"ground; check the camera's clock and mounting: {'; '.join(elsewhere[:5])}"
+                f"ground and no paint; check the camera's clock and mounting: {'; '.join(elsewhere[:5])}"
             )
 
     def _join(self, session: Session, plan: AssetPlan) -> None:
@@ -276,7 +276,8 @@ class Assets(Stage):
         return (
             "tables/intensity_samples", "tables/intensity_gains", "tables/scene_statistics", "tables/asset_evidence",
             "tables/asset_objects",
-            "tables/asset_screens", "tables/asset_ground", "tables/asset_green", "tables/asset_visibility",
+            "tables/asset_screens", "tables/asset_ground", "tables/asset_green", "tables/asset_painted",
+            "tables/asset_visibility",
             "tables/asset_pictures", ASSET_FOLDER, PICTURE_FOLDER,
             "products/classified_points", "products/ground_sections", "products/bare_earth",
         )  # fmt: skip

@@ -23,6 +23,8 @@ EDGE_M = 3.1
 """Lawn lies to the east of this easting, which is no corner of a cell (m)."""
 SIDE = 40
 """Edge of the window (cells)."""
+NO_COLOURS = np.zeros((0, 3), np.uint8), np.zeros(0, np.bool_)
+"""Colours of fine cells, which green ground does not use."""
 
 
 def lit(colour: tuple[int, int, int], gains: tuple[float, float, float]) -> np.ndarray:
@@ -84,7 +86,7 @@ def look(edge_m: float = EDGE_M) -> Look:
     _, column = whole_window()
     at = column[:, None] * CELL_M + (np.tile(np.arange(FINE), FINE) + 0.5) * FINE_M
     index = 0.2 * np.clip((at - edge_m) / FINE_M + 0.5, 0.0, 1.0)
-    return Look(np.arange(SIDE**2), index, np.full(SIDE**2, 0.06))
+    return Look(np.arange(SIDE**2), index, np.full(SIDE**2, 0.06), *NO_COLOURS)
 
 
 def green_of(looks: list[tuple[Look, int]], drive_m: float = 5.0) -> pa.Table:
@@ -111,7 +113,8 @@ def test_windows_of_squares_change_no_cell() -> None:
     random = np.random.default_rng(3)
     base = look()
     noisy = [
-        (Look(base.cells, base.index + random.normal(0, 0.03, base.index.shape), base.pixel_m), h) for h in (0, 1, 1)
+        (Look(base.cells, base.index + random.normal(0, 0.03, base.index.shape), base.pixel_m, *NO_COLOURS), h)
+        for h in (0, 1, 1)
     ]
     whole = green_of(noisy)
     sums = Sums(SIDE**2)
@@ -130,7 +133,7 @@ def test_windows_of_squares_change_no_cell() -> None:
 
 def areas(pieces: pa.Table, green: pa.Table | None) -> list:
     kind = LandscapeArea()
-    held = pieces if green is None else kind.with_green(pieces, green)
+    held = pieces if green is None else kind.with_pictures(pieces, green)
     return list(kind.objects(held, LandscapeOptions(), {}))
 
 
@@ -200,7 +203,7 @@ def test_a_verge_is_moved_to_the_lawn_and_a_kerb_is_not() -> None:
     rows = [line_at(2.8, names, sigma_m=0.15) | rest(), line_at(2.8, names, sigma_m=0.02, by_kerb=1.0) | rest(),
             line_at(1.5, names, sigma_m=0.15) | rest()]  # fmt: skip
     pieces = pa.Table.from_pylist(rows, schema=kind.piece_schema)
-    verge, kerb, far = kind.with_green(pieces, green_of([(look(), 0), (look(), 1)])).to_pylist()
+    verge, kerb, far = kind.with_pictures(pieces, green_of([(look(), 0), (look(), 1)])).to_pylist()
     assert np.array(verge["easting_m"]) == pytest.approx(EDGE_M, abs=FINE_M)
     assert max(verge["sigma_m"]) < 0.08
     assert kerb == pieces.to_pylist()[1] and far == pieces.to_pylist()[2]
@@ -210,7 +213,7 @@ def test_a_sidewalk_ends_at_a_flush_lawn() -> None:
     names = [f.name for f in BESIDE_PIECES if pa.types.is_list(f.type) and f.name != "passes"]
     rows = [line_at(1.5, names, width_m=5.0, ends_down=1.0) | rest(), line_at(1.5, names, width_m=1.2) | rest()]
     pieces = pa.Table.from_pylist(rows, schema=BESIDE_PIECES)
-    wide, narrow = Sidewalk().with_green(pieces, green_of([(look(), 0), (look(), 1)])).to_pylist()
+    wide, narrow = Sidewalk().with_pictures(pieces, green_of([(look(), 0), (look(), 1)])).to_pylist()
     assert np.array(wide["width_m"]) == pytest.approx(EDGE_M - 1.5, abs=1.5 * FINE_M)
     assert min(wide["ends_known"]) == 1.0 and max(wide["ends_down"]) == 0.0
     assert narrow == pieces.to_pylist()[1]

@@ -14,8 +14,8 @@ from roadscan.assets.green.colours import FINE, FINE_M, Look
 from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.extras import cv2
 
-MARGIN_CELLS: Final = 12
-"""Cells around a square that change what is found in it: an opening, and means around an edge."""
+MARGIN_CELLS: Final = 32
+"""Cells around a square that change what is found in it (8 m): openings, means around an edge, symbols of paint."""
 _GREEN: Final = 0.045
 """Greenness from which ground is planted; the edge lies midway between both sides."""
 _LEAST: Final = 2

@@ -134,6 +134,10 @@ class Look:
     """(k, 25) greenness of the fine cells; NaN where it is not told."""
     pixel_m: Float64
     """(k,) how much of the ground a pixel spans along the ray (m)."""
+    colour: UInt8
+    """(k · 25, 3) red, green, blue of the fine cells."""
+    shown: Bool
+    """(k · 25,) where the picture shows them."""
 
 
 def linear(colours: UInt8) -> Float64:
@@ -188,7 +192,7 @@ def looked_at(
     cells = near[seen]
     colour, shown = _colours(picture, one, placed.stepped(cells, ground.fine_steps_m(cells)))
     index = np.where(shown, greenness(colour, reference), np.nan).reshape(-1, FINE * FINE)
-    return Look(cells, index, pixel_m[cells])
+    return Look(cells, index, pixel_m[cells], colour, shown)
 
 
 def _colours(picture: UInt8, one: Pictures, worlds_m: list[Float64]) -> tuple[UInt8, Bool]:

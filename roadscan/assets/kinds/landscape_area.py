@@ -269,9 +269,9 @@ class LandscapeArea(AssetKind):
         """Returns cells of the tile."""
         return Evidence(grown_cells(scene, options))
 
-    def with_green(self, pieces: pa.Table, green: pa.Table) -> pa.Table:
+    def with_pictures(self, pieces: pa.Table, shown: pa.Table) -> pa.Table:
         """Returns cells that are grown over or green, with the parts of each that belong to the area, and σ."""
-        return cells_with_green(pieces, green)
+        return cells_with_green(pieces, shown)
 
     def objects(
         self, pieces: pa.Table, options: LandscapeOptions, others: Mapping[str, Sequence[AssetObject]]

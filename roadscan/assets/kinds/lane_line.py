@@ -15,7 +15,7 @@ from pydantic import Field
 
 from roadscan.assets.classes import MARKING
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
-from roadscan.assets.paint.detection import LINE_PIECES, line_pieces, paint_of, rows_of_paint
+from roadscan.assets.paint.detection import LINE_PIECES, line_pieces, paint_of, rows_of_paint, shown_pieces
 from roadscan.assets.scene import Scene
 from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.core.strict import Strict
@@ -410,6 +410,7 @@ class LaneLine(AssetKind):
     curve = "products"
     options = LaneLineOptions
     piece_schema: ClassVar[pa.Schema] = LINE_PIECES
+    sees_paint: ClassVar[bool] = True
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:
         """Returns straight pieces of lines in the tile."""
@@ -417,6 +418,10 @@ class LaneLine(AssetKind):
         marked = Marked(rows_of_paint(paint.contrast, paint.lines), MARKING)
         counts = {"dense_cells": paint.contrast.dense_cells, "rough_cells": paint.contrast.rough_cells}
         return Evidence(line_pieces(scene, paint), (marked,), counts)
+
+    def with_pictures(self, pieces: pa.Table, shown: pa.Table) -> pa.Table:
+        """Returns pieces, and those of lines that pictures alone show."""
+        return pa.concat_tables([pieces, shown_pieces(shown, "line", LINE_PIECES)])
 
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]

@@ -45,9 +45,9 @@ class RoadEdge(AssetKind):
 
     sees_green: ClassVar[bool] = True
 
-    def with_green(self, pieces: pa.Table, green: pa.Table) -> pa.Table:
+    def with_pictures(self, pieces: pa.Table, shown: pa.Table) -> pa.Table:
         """Returns pieces whose verges begin where pictures show it."""
-        return moved_to_green(pieces, green)
+        return moved_to_green(pieces, shown)
 
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]

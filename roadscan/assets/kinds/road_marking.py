@@ -15,7 +15,17 @@ import shapely
 from roadscan.assets.classes import MARKING
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
 from roadscan.assets.paint.components import CELL_M
-from roadscan.assets.paint.detection import SYMBOL_M, Paint, Patch, height_sigma, paint_of, rows_of_paint
+from roadscan.assets.paint.detection import (
+    SYMBOL_M,
+    Paint,
+    Patch,
+    covers,
+    height_sigma,
+    line_outlines,
+    paint_of,
+    rows_of_paint,
+    shown_pieces,
+)
 from roadscan.assets.paint.symbols import ARROWS, symbol_of, turned
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.slices import places_of
@@ -78,6 +88,19 @@ def _piece(scene: Scene, paint: Paint, patch: Patch, shape: shapely.Geometry) ->
         "first_epoch_gps_ns": int(own.epoch_gps_ns.min()),
         "last_epoch_gps_ns": int(own.epoch_gps_ns.max()),
     }
+
+
+def with_pictured(pieces: pa.Table, shown: pa.Table) -> pa.Table:
+    """Returns pieces of markings with those that pictures show, in place of the parts of them that the lidar found.
+
+    A line of which few returns tell consists of spots, which look like markings to the lidar.
+    """
+    lines = line_outlines(row for row in shown["line"].to_pylist() if row is not None)
+    added = shown_pieces(shown, "patch", PATCH_PIECES)
+    wholes = np.array([*lines, *shapely.from_wkb(added["shape"].to_numpy(zero_copy_only=False))], dtype=object)
+    tree, parts = shapely.STRtree(wholes), shapely.from_wkb(pieces["shape"].to_numpy(zero_copy_only=False))
+    kept = [not (near := tree.query(part)).size or not covers(wholes[near], part) for part in parts]
+    return pa.concat_tables([pieces.filter(pa.array(kept, pa.bool_())), added])
 
 
 _MARKER_M: Final = 0.30  # Largest marker (m).
@@ -253,12 +276,17 @@ class RoadMarking(AssetKind):
     title = "road markings"
     curve = "products"
     piece_schema: ClassVar[pa.Schema] = PATCH_PIECES
+    sees_paint: ClassVar[bool] = True
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:
         """Returns polygons of markings in the tile."""
         paint = paint_of(scene)
         paint = replace(paint, patches=tuple(p for p in paint.patches if not _at_foot(scene, p)))
         return Evidence(patch_pieces(scene, paint), (Marked(rows_of_paint(paint.contrast, paint.patches), MARKING),))
+
+    def with_pictures(self, pieces: pa.Table, shown: pa.Table) -> pa.Table:
+        """Returns pieces without those that are parts of paint in pictures, and those that pictures show."""
+        return with_pictured(pieces, shown)
 
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]

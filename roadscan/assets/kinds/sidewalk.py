@@ -46,9 +46,9 @@ class Sidewalk(AssetKind):
 
     sees_green: ClassVar[bool] = True
 
-    def with_green(self, pieces: pa.Table, green: pa.Table) -> pa.Table:
+    def with_pictures(self, pieces: pa.Table, shown: pa.Table) -> pa.Table:
         """Returns pieces whose surfaces end where pictures show green ground."""
-        return ended_at_green(pieces, green)
+        return ended_at_green(pieces, shown)
 
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]

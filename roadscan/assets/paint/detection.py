@@ -8,9 +8,9 @@ streets apart, not paint; without them it judges unseen ones better.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple, Self
+from typing import Any, Final, NamedTuple, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -245,13 +245,23 @@ class Paint:
 def paint_of(scene: Scene) -> Paint:
     """Returns the paint of a scene."""
     found = contrast_of(scene)
-    road = RoadDirection(scene)
+    shapes = judged(scene, found, components_of(found))
+    return sorted_paint(found, shapes, scene.returns.corner_m, RoadDirection.of(scene))
+
+
+def sorted_paint(
+    found: Contrast, shapes: Sequence[Component], corner_m: tuple[float, float], road: RoadDirection
+) -> Paint:
+    """Returns components that are paint, as lines along the road and as all else.
+
+    corner_m : the map's place of the components' origin.
+    """
     bands: list[Stripe] = []
     others: list[Component] = []
-    for component in judged(scene, found, components_of(found)):
+    for component in shapes:
         stripes = None
         if not _is_symbol(component, road):
-            stripes = stripes_of(found, component, scene.returns.corner_m, road)
+            stripes = stripes_of(found, component, corner_m, road)
         if stripes is None:
             others.append(component)
         else:
@@ -331,10 +341,7 @@ def _lies_across(stripe: Stripe, road_rad: float) -> bool:
 
 
 def _of_stripe(stripe: Stripe, crossed: bool, road_rad: float) -> Patch:
-    aside = stripe.width_m / 2 * np.array([-stripe.along[1], stripe.along[0]])
-    begin, end = stripe.at(stripe.begin_m), stripe.at(stripe.end_m)
-    shape = shapely.Polygon([begin - aside, end - aside, end + aside, begin + aside])
-    return Patch(shape, crossed, road_rad, stripe.contrast, stripe.probability, stripe.returns, stripe.around)
+    return Patch(stripe.outline, crossed, road_rad, stripe.contrast, stripe.probability, stripe.returns, stripe.around)
 
 
 def _of_cells(found: Contrast, component: Component, crossed: bool, road_rad: float) -> Patch:
@@ -370,6 +377,31 @@ LINE_PIECES: Final = pa.schema(
 _SHORTEST_M: Final = 0.01  # Shorter pieces are left out (m).
 
 
+_PART: Final = 0.7
+"""What lies by this share in a shape is a part of it …"""
+_ROUND_M: Final = 0.1  # … which may be so much larger on all sides (m).
+
+
+def line_outlines(rows: Iterable[Mapping[str, Any]]) -> list[shapely.Geometry]:
+    """Returns the outlines of pieces of lines, as rows of `LINE_PIECES`."""
+    return [
+        shapely.LineString([(r["begin_x_m"], r["begin_y_m"]), (r["end_x_m"], r["end_y_m"])])
+        .buffer(r["width_m"] / 2, cap_style="flat")
+        for r in rows
+    ]  # fmt: skip
+
+
+def covers(shapes: Sequence[shapely.Geometry], part: shapely.Geometry) -> bool:
+    """Returns whether shapes cover most of a smaller one."""
+    whole = shapely.union_all(shapes).buffer(_ROUND_M)
+    return bool(shapely.intersection(whole, part).area >= _PART * part.area)
+
+
+def shown_pieces(shown: pa.Table, name: str, schema: pa.Schema) -> pa.Table:
+    """Returns the pieces in a column of structures of `roadscan.assets.tasks.pictured_paint.PAINTED`."""
+    return pa.Table.from_pylist([row for row in shown[name].to_pylist() if row is not None], schema=schema)
+
+
 def line_pieces(scene: Scene, paint: Paint) -> pa.Table:
     """Returns pieces of lines within the scene's tile, in the order of the paint's lines."""
     rows = [piece for stripe in paint.lines if (piece := _piece(scene, paint, stripe)) is not None]
@@ -378,7 +410,7 @@ def line_pieces(scene: Scene, paint: Paint) -> pa.Table:
 
 def _piece(scene: Scene, paint: Paint, stripe: Stripe) -> dict[str, object] | None:
     """Returns the part of a stripe in the tile."""
-    span = _within(stripe, scene.tile)
+    span = within(stripe, scene.tile)
     if span is None:
         return None
     begin, end = stripe.at(span[0]), stripe.at(span[1])
@@ -412,7 +444,7 @@ def height_sigma(above_m: Float64) -> float:
     return float(np.std(above_m) / np.sqrt(above_m.size) + abs(float(np.median(above_m))))
 
 
-def _within(stripe: Stripe, box: Box) -> tuple[float, float] | None:
+def within(stripe: Stripe, box: Box) -> tuple[float, float] | None:
     """Returns where the centre line runs inside a box (Liang and Barsky, 1984), from its middle; None outside."""
     low, high = stripe.begin_m, stripe.end_m
     for axis, (least, greatest) in enumerate(((box.x_min_m, box.x_max_m), (box.y_min_m, box.y_max_m))):

@@ -7,6 +7,7 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
+import shapely
 
 from roadscan.assets.paint.components import CELL_M, SEED_CONTRAST, Component, Contrast
 from roadscan.assets.quantiles import median
@@ -23,7 +24,12 @@ _FARTHEST_M: Final = 25.0  # No direction is known farther from all drives (m).
 class RoadDirection:
     """Direction of the drive nearest to a place."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, place_m: Float64, direction_rad: Float64) -> None:
+        self._place, self._direction = place_m, direction_rad
+
+    @classmethod
+    def of(cls, scene: Scene) -> RoadDirection:
+        """Returns the directions of a scene's drives."""
         places, directions = [np.zeros((0, 2))], [np.zeros(0)]
         drive = scene.drive_xyh_m
         for number in np.unique(drive[:, 3]) if len(drive) else []:
@@ -37,8 +43,7 @@ class RoadDirection:
             chord = _along(at + _OVER_M, driven[moved], xy[moved]) - _along(at - _OVER_M, driven[moved], xy[moved])
             places.append(place)
             directions.append(np.arctan2(chord[:, 1], chord[:, 0]))
-        self._place = np.concatenate(places)
-        self._direction = np.concatenate(directions)
+        return cls(np.concatenate(places), np.concatenate(directions))
 
     def at(self, x_m: float, y_m: float) -> float:
         """Returns the direction (rad) anticlockwise from x; NaN where no drive is within 25 m."""
@@ -119,6 +124,13 @@ class Stripe:
     def length_m(self) -> float:
         """Returns the length of the band."""
         return self.end_m - self.begin_m
+
+    @property
+    def outline(self) -> shapely.Polygon:
+        """Returns its rectangle."""
+        aside = self.width_m / 2 * np.array([-self.along[1], self.along[0]])
+        begin, end = self.at(self.begin_m), self.at(self.end_m)
+        return shapely.Polygon([begin - aside, end - aside, end + aside, begin + aside])
 
     def at(self, along_m: float) -> Float64:
         """Returns a point (2,) of the centre line."""

@@ -1,23 +1,24 @@
-"""Green ground of squares, from all pictures that show it: the plan, and the work on workers."""
+"""Green ground and paint of squares, from all pictures that show them: the plan, and the work on workers."""
 
 from __future__ import annotations
 
 import functools
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pyarrow as pa
 
-from roadscan.assets.green.areas import MARGIN_CELLS, Mosaic, Sums, green_rows, mosaic_of
+from roadscan.assets.green.areas import MARGIN_CELLS, Sums, green_rows, mosaic_of
 from roadscan.assets.green.cells import CELL_M
 from roadscan.assets.green.colours import REACH_M, Elsewhere, Ground, PlacedGround, ground_of, looked_at
+from roadscan.assets.scene import Box
 from roadscan.assets.settings import picture_rule
-from roadscan.assets.tasks.evidence import GROUND, SCREENS
-from roadscan.assets.tasks.objects import GREEN
+from roadscan.assets.tasks.evidence import EVIDENCE, GROUND, SCREENS
+from roadscan.assets.tasks.objects import GREEN, PAINTED
 from roadscan.assets.tasks.pictures import hidden_cells
 from roadscan.assets.tasks.plan import AssetPlan
 from roadscan.assets.tiling import AssetGrid
@@ -32,6 +33,9 @@ from roadscan.store.digest import bytes_digest
 from roadscan.store.manifest import Manifest, OutputRecord, publish_table, recorded_table
 from roadscan.store.store import Store
 from roadscan.tiles.tasks.tiles import TaskResult
+
+if TYPE_CHECKING:
+    from roadscan.assets.tasks.pictured_paint import Window
 
 _MARGIN_M: Final = MARGIN_CELLS * CELL_M
 _AROUND_M: Final = _MARGIN_M + 2.0 * REACH_M + 1.0
@@ -49,6 +53,8 @@ class GreenTask:
     ground: tuple[tuple[TileId, OutputRecord], ...]
     """Cells of the ground in them and around them."""
     screens: tuple[tuple[TileId, OutputRecord], ...]
+    paint: tuple[tuple[TileId, OutputRecord], ...]
+    """Pieces of lines and markings in them and around them."""
     pictures: Pictures
 
     @property
@@ -70,7 +76,11 @@ class GreenPlan:
 
     def due(self, manifest: Manifest) -> list[TileId]:
         """Returns those that are missing or stale."""
-        return [square for square, key in self.keys.items() if not manifest.is_current(GREEN, str(square), key)]
+        return [
+            square
+            for square, key in self.keys.items()
+            if not all(manifest.is_current(name, str(square), key) for name in (GREEN, PAINTED))
+        ]
 
     def elsewhere(self, manifest: Manifest) -> list[str]:
         """Returns the names of the pictures that do not lie where their times and poses say."""
@@ -79,24 +89,25 @@ class GreenPlan:
 
     def gone(self, manifest: Manifest) -> list[OutputRecord]:
         """Returns outputs of squares that no picture shows any more."""
-        return manifest.beside({GREEN}, {str(square) for square in self.keys})
+        return manifest.beside({GREEN, PAINTED}, {str(square) for square in self.keys})
 
 
 def plan_green(plan: AssetPlan, manifest: Manifest) -> GreenPlan:
     """Returns the squares whose ground is to be looked at; none without pictures or a kind that asks for them."""
-    if not (plan.wants_pictures and any(one.kind.sees_green for one in plan.kinds)):
+    if not (plan.wants_pictures and any(one.kind.sees_green or one.kind.sees_paint for one in plan.kinds)):
         return GreenPlan()
     try:
         pictures = plan_pictures(plan.survey, replace(picture_rule(plan.config.pictures), reach_m=REACH_M))
     except (ConfigError, RunError):  # the search for pictures of objects says why
         return GreenPlan()
-    ground, screens = _held(manifest, GROUND), _held(manifest, SCREENS)
+    ground, screens, paint = _held(manifest, GROUND), _held(manifest, SCREENS), _paint(plan, manifest)
     code = code_digest("roadscan.assets.tasks.green:find_green")
     keys = {}
     for square in ground:
         near = pictures.near(_box(plan.grid, square))
         if len(near):
             read = [[r.digest for _, r in _around(plan.grid, square, some)] for some in (ground, screens)]
+            read.append([record.digest for _, record in _paint_around(square, paint)])
             keys[square] = key_of(code, near.key(), read, plan.grid.edge_m)
     return GreenPlan(keys, pictures)
 
@@ -105,13 +116,15 @@ def green_tasks(plan: AssetPlan, green: GreenPlan, manifest: Manifest, workers: 
     """Returns tasks over neighbouring squares, which share pictures."""
     if green.pictures is None:
         return []
-    ground, screens, tasks = _held(manifest, GROUND), _held(manifest, SCREENS), []
+    ground, screens, paint = _held(manifest, GROUND), _held(manifest, SCREENS), _paint(plan, manifest)
+    tasks = []
     for squares in plan.blocks(green.due(manifest), workers):
-        own = [{s: r for square in squares for s, r in _around(plan.grid, square, some)} for some in (ground, screens)]
+        read = [{s: r for square in squares for s, r in _around(plan.grid, square, some)} for some in (ground, screens)]
         near = green.pictures.near(*(_box(plan.grid, square) for square in squares))
         tasks.append(
             GreenTask(plan.survey.store, plan.grid, tuple((s, green.keys[s]) for s in squares),
-                      tuple(own[0].items()), tuple(own[1].items()), near)
+                      tuple(read[0].items()), tuple(read[1].items()),
+                      tuple(dict.fromkeys(one for s in squares for one in _paint_around(s, paint))), near)
         )  # fmt: skip
     return tasks
 
@@ -119,6 +132,22 @@ def green_tasks(plan: AssetPlan, green: GreenPlan, manifest: Manifest, workers: 
 def _held(manifest: Manifest, name: str) -> dict[TileId, OutputRecord]:
     found = {TileId.parse(unit): record for unit, record in manifest.of(name).items() if record.path}
     return dict(sorted(found.items(), key=lambda one: (one[0].row, one[0].column)))
+
+
+def _paint(plan: AssetPlan, manifest: Manifest) -> list[tuple[TileId, OutputRecord]]:
+    """Returns pieces of lines and markings that the lidar found, by kind and square."""
+    kinds, found = {one.name for one in plan.kinds if one.kind.sees_paint}, []
+    for unit, record in sorted(manifest.of(EVIDENCE).items()):
+        kind, _, square = unit.partition("/")
+        if record.path and kind in kinds:
+            found.append((TileId.parse(square), record))
+    return found
+
+
+def _paint_around(
+    square: TileId, paint: Sequence[tuple[TileId, OutputRecord]]
+) -> Sequence[tuple[TileId, OutputRecord]]:
+    return [one for one in paint if abs(one[0].column - square.column) <= 1 and abs(one[0].row - square.row) <= 1]
 
 
 def _box(grid: AssetGrid, square: TileId, beyond_m: float = _MARGIN_M) -> Bounds:
@@ -136,7 +165,7 @@ def _around(grid: AssetGrid, square: TileId, held: Mapping[TileId, OutputRecord]
 
 
 def find_green(task: GreenTask) -> TaskResult:
-    """Look at the ground of a task's squares, and write the planted cells (runs on a worker)."""
+    """Look at the ground of a task's squares, and write the planted cells and the paint (runs on a worker)."""
     records: list[OutputRecord] = []
     failures: list[tuple[str, str]] = []
     source = ColourSource(task.pictures)
@@ -144,7 +173,9 @@ def find_green(task: GreenTask) -> TaskResult:
     screens = {square: recorded_table(task.store, record) for square, record in task.screens}
     for square, key in task.work:
         try:
-            records.append(_record(task, square, key, _found(task, square, ground, screens, source)))
+            green, painted, counts = _found(task, square, ground, screens, source)
+            records.append(_record(task, square, key, GREEN, green, {"cells": green.num_rows, **counts}))
+            records.append(_record(task, square, key, PAINTED, painted, {"pieces": painted.num_rows}))
         except Exception as error:  # noqa: BLE001  one square's fault must not stop the others
             failures.append((str(square), reason_of(error)))
     return TaskResult.of(records, failures)
@@ -156,14 +187,18 @@ def _found(
     ground: Mapping[TileId, pa.Table],
     screens: Mapping[TileId, pa.Table],
     source: ColourSource,
-) -> tuple[pa.Table, dict[str, Any]]:
-    """Returns rows of a square's planted cells, how many pictures told of it, and which lie elsewhere."""
+) -> tuple[pa.Table, pa.Table, dict[str, Any]]:
+    """Returns rows of a square's planted cells and of its paint, and how many pictures show them or lie elsewhere."""
+    from roadscan.assets.paint.brightness import BrightSums, brightness_in
+    from roadscan.assets.tasks.pictured_paint import pictured_paint
+
     held = dict(task.ground)
     rows = pa.concat_tables([ground[name] for name, _ in _around(task.grid, square, held)])
     cells, rows = ground_of(rows, _box(task.grid, square, _AROUND_M))
     hides = [screens[name] for name, _ in _around(task.grid, square, dict(task.screens))]
     near = task.pictures.near(_box(task.grid, square))
-    sums, told, elsewhere = Sums(len(cells.column)), 0, list[str]()
+    sums, bright = Sums(len(cells.column)), BrightSums(len(cells.column))
+    shown_by, elsewhere = 0, list[str]()
     placed = PlacedGround.of(cells, near)
     voxels = pa.concat_tables([SCREEN_ROWS.empty_table(), *hides])
     for number in range(len(near)):
@@ -176,28 +211,40 @@ def _found(
             elsewhere.append(near.name(number))
         elif look is not None:
             sums.add(look, int(bytes_digest(near.name(number).encode())[-1], 16) & 1)
-            told += 1
-    mosaic, first = _window(task.grid, square, cells, sums)
-    own = _box(task.grid, square, 0.0)
-    table = green_rows(
-        mosaic, first, rows, (own.easting_min_m, own.northing_min_m, own.easting_max_m, own.northing_max_m)
+            bright.add(look.cells, brightness_in(look.colour, look.shown, look.cells, cells), look.pixel_m)
+            shown_by += 1
+    known = [recorded_table(task.store, record) for _, record in _paint_around(square, task.paint)]
+    window, box = _window(task.grid, square, cells, rows, known)
+    mosaic = mosaic_of(sums, window.cell, window.at, window.shape, cells.drive_m[window.cell])
+    first = round(window.corner_m[1] / CELL_M), round(window.corner_m[0] / CELL_M)
+    inner = _box(task.grid, square, 0.0)
+    green = green_rows(
+        mosaic, first, rows, (inner.easting_min_m, inner.northing_min_m, inner.easting_max_m, inner.northing_max_m)
     )
-    return table, {"pictures": told, "elsewhere": elsewhere}
+    return green, pictured_paint(bright, window, box), {"pictures": shown_by, "elsewhere": elsewhere}
 
 
-def _window(grid: AssetGrid, square: TileId, cells: Ground, sums: Sums) -> tuple[Mosaic, tuple[int, int]]:
-    """Returns the mosaic of a square with its margin, and the row and column of its first cell."""
+def _window(
+    grid: AssetGrid, square: TileId, cells: Ground, rows: pa.Table, paint: Sequence[pa.Table]
+) -> tuple[Window, Box]:
+    """Returns a square with its margin, and the square's box in it."""
+    from roadscan.assets.tasks.pictured_paint import Known, Window
+
     box = _box(grid, square)
     first = round(box.northing_min_m / CELL_M), round(box.easting_min_m / CELL_M)
     shape = round(box.northing_max_m / CELL_M) - first[0], round(box.easting_max_m / CELL_M) - first[1]
     row, column = cells.row - first[0], cells.column - first[1]
     inside = np.flatnonzero((row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1]))
-    return mosaic_of(sums, inside, (row[inside], column[inside]), shape, cells.drive_m[inside]), first
+    corner_m = box.easting_min_m, box.northing_min_m
+    known = Known.of(paint, corner_m)
+    inner = Box(_MARGIN_M, _MARGIN_M, _MARGIN_M + grid.edge_m, _MARGIN_M + grid.edge_m)
+    return Window(inside, (row[inside], column[inside]), shape, cells, rows, corner_m, known), inner
 
 
-def _record(task: GreenTask, square: TileId, key: str, found: tuple[pa.Table, dict[str, Any]]) -> OutputRecord:
-    rows, counts = found
-    detail = json.dumps({"cells": rows.num_rows, **counts})
+def _record(
+    task: GreenTask, square: TileId, key: str, name: str, rows: pa.Table, counts: Mapping[str, Any]
+) -> OutputRecord:
+    detail = json.dumps(counts)
     if not rows.num_rows:
-        return OutputRecord(GREEN, str(square), key, "", 0, "", detail)
-    return publish_table(task.store, rows, GREEN, str(square), key, detail)
+        return OutputRecord(name, str(square), key, "", 0, "", detail)
+    return publish_table(task.store, rows, name, str(square), key, detail)

@@ -25,6 +25,8 @@ from roadscan.tiles.tasks.tiles import TaskResult
 OBJECTS: Final = "asset_objects"
 GREEN: Final = "asset_green"
 """Manifest name of the planted cells of a square that pictures tell."""
+PAINTED: Final = "asset_painted"
+"""Manifest name of the paint of a square that pictures show."""
 
 
 @dataclass(frozen=True)
@@ -63,8 +65,8 @@ class JoinTask:
     others: tuple[tuple[str, tuple[OutputRecord, ...]], ...]
     """Objects of other kinds near it, which this one uses."""
     key: str
-    green: tuple[OutputRecord, ...] = ()
-    """Green ground of its squares in pictures, for kinds that use it."""
+    pictured: tuple[OutputRecord, ...] = ()
+    """Green ground or paint of its squares in pictures, for kinds that use it."""
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -98,8 +100,9 @@ def plan_joins(
         for r in manifest.of(EVIDENCE).values()
         if r.path and r.unit.startswith(f"{wanted.name}/")
     }
-    green = {TileId.parse(u): r for u, r in manifest.of(GREEN).items() if r.path and wanted.kind.sees_green}
-    own = clusters[wanted.name] = [Cluster(wanted.name, squares) for squares in clustered({**held, **green})]
+    looked = {GREEN} if wanted.kind.sees_green else {PAINTED} if wanted.kind.sees_paint else set[str]()
+    shown_of = {TileId.parse(u): r for name in looked for u, r in manifest.of(name).items() if r.path}
+    own = clusters[wanted.name] = [Cluster(wanted.name, squares) for squares in clustered({**held, **shown_of})]
     objects, code = manifest.of(OBJECTS), wanted.objects_key()
     tasks = []
     for cluster in own:
@@ -113,7 +116,7 @@ def plan_joins(
             if name in clusters
         )
         pieces = tuple(held[square] for square in cluster.squares if square in held)
-        seen = tuple(green[square] for square in cluster.squares if square in green)
+        seen = tuple(shown_of[square] for square in cluster.squares if square in shown_of)
         read = [[name, [(r.unit, r.digest) for r in records]] for name, records in others]
         shown = [[(r.unit, r.digest) for r in seen]] if seen else []
         key = key_of(code, grid.edge_m, [(r.unit, r.digest) for r in pieces], read, *shown)
@@ -161,8 +164,8 @@ def _joined(task: JoinTask) -> OutputRecord:
     name = task.cluster.kind
     kind, schema = asset_kinds()[name], asset_schema(name).arrow()
     pieces = pa.concat_tables([kind.piece_schema.empty_table(), *(_read(task.store, r) for r in task.pieces)])
-    if task.green:
-        pieces = kind.with_green(pieces, pa.concat_tables([_read(task.store, r) for r in task.green]))
+    if task.pictured:
+        pieces = kind.with_pictures(pieces, pa.concat_tables([_read(task.store, r) for r in task.pictured]))
     near = task.cluster.near()
     others = {other: _near(task, records, near) for other, records in task.others}
     curve = curve_named(kind.curve)

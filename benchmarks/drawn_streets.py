@@ -227,6 +227,60 @@ def street_of_shafts(seed: int, *, lamp_arm_m: float = 3.0) -> Scene:
     return street.changed(id=f"shafts-{seed}", roadside=held, lidar=lidar, vehicle=vehicle, bag={"on": True})
 
 
+def street_of_plates(seed: int) -> Scene:
+    """A drawn street with signs of all sizes and what is like them: fronts with windows and boards, vans, lorries."""
+    random = np.random.default_rng([seed, 59])
+    street = drawn_street(seed)
+    paved = street.road.paved_m
+    between = _between(random)
+
+    kinds = ("signs", "facades", "parked_cars", "furniture", "fences")
+    things = street.roadside.model_dump() | {kind: [] for kind in kinds}
+    for side in (-1.0, 1.0):
+        away = paved + between(2.0, 7.0)
+        if random.random() < 0.8:
+            for start in np.arange(-20.0, LENGTH_M + 20.0, 14.0).tolist():
+                window, front, end = between(0.7, 2.2), away + between(0.0, 1.0), start + between(9.0, 14.0)
+                things["facades"].append({
+                    "offset_m": side * front, "start_m": start, "end_m": end,
+                    "height_m": between(3.5, 13.0), "storey_m": between(2.8, 3.6), "window_m": window,
+                    "bay_m": window + between(0.5, 2.5), "glass": between(0.3, 0.9), "depth_m": 6.0,
+                    "shade": between(90.0, 200.0),
+                })  # fmt: skip
+                for what, before in (("shop_sign", 0.08), ("hanging_sign", 0.5), ("balcony", 0.6), ("door", 0.06)):
+                    things["furniture"].append({
+                        "what": what, "station_m": between(start + 1.0, end - 1.0), "offset_m": side * (front - before),
+                        "scale": between(0.7, 1.4), "shade": between(60.0, 255.0),
+                    })  # fmt: skip
+        for station in np.arange(2.0, LENGTH_M, 5.0):
+            sign = _large_or_small(random, float(station))
+            sign["offset_m"] = side * (paved + between(0.3, 1.8) + sign["width_m"] / 2.0)
+            sign |= {"clearance_m": between(1.6, 3.2), "shade": between(140.0, 255.0)}
+            what = str(random.choice(["sign", "sign", "sign", "billboard", "van", "lorry"]))
+            if what == "sign":
+                things["signs"].append(sign)
+            elif what == "billboard":
+                things["furniture"].append({
+                    "what": what, "station_m": float(station), "offset_m": side * (paved + between(0.6, 2.0)),
+                    "scale": between(0.75, 1.3), "shade": between(25.0, 255.0),
+                    "heading_deg": float(random.choice([0.0, 90.0])) + between(-8.0, 8.0),
+                })  # fmt: skip
+            else:
+                things["vehicles"].append({
+                    "what": what, "station_m": float(station), "offset_m": side * (paved - 1.0),
+                    "heading_deg": between(-4.0, 4.0) + 180.0 * float(random.random() < 0.5),
+                    "form": int(random.integers(0, 60)), "glass": between(0.3, 0.7), "shade": between(20.0, 240.0),
+                })  # fmt: skip
+    things["moving_cars"] = [{
+        "what": str(random.choice(["van", "lorry"])), "station_m": between(-10.0, 20.0),
+        "speed_m_per_s": between(5.0, 9.0), "offset_m": 1.6, "form": int(random.integers(0, 60)),
+        "shade": between(20.0, 240.0),
+    }]  # fmt: skip
+    model = str(random.choice(["HDL-32E", "HDL-32E", "VLP-16", "OS1-128", "XT32"]))
+    lidar = street.lidar.model_dump() | {"model": model, "divergence_deg": "data sheet"}
+    return street.changed(id=f"plates-{seed}", roadside=things, lidar=lidar, bag={"on": model == "VLP-16"})
+
+
 SYMBOLS: Final = ("ahead", "left", "right", "ahead_left", "ahead_right", "triangle", "diamond", "bicycle")
 
 

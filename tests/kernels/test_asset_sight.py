@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from roadscan.assets.kernels.sight import Places, Rays, follow_rays, rays_at_shafts, rays_near
+from roadscan.assets.kernels.sight import Places, Rays, follow_rays, rays_at_plates, rays_at_shafts, rays_near
 from roadscan.compute.kernel_options import read_only
 
 CELL_M = 0.5
@@ -128,4 +128,46 @@ def test_rays_at_leaning_shafts_are_those_that_numpy_counts() -> None:
             ended = told & own & ~passed & (length - along >= -radius - (behind if part else before))
             expected[k, part] = np.count_nonzero(ended), np.count_nonzero(passed)
     assert (expected[1] > 20).all() and expected[..., 1].min() > 5
+    assert counts.tolist() == expected.tolist()
+
+
+def test_rays_at_plates_are_those_that_numpy_counts() -> None:
+    random = np.random.default_rng(11)
+    starts = random.uniform([-10, -10, 1], [10, 10, 4], (40_000, 3))
+    ends = random.uniform([-10, -10, -1], [10, 10, 6], (40_000, 3))
+    facing, tilt = np.radians([20.0, -130.0]), np.radians([0.0, 6.0])
+    normal = np.column_stack([np.cos(tilt) * np.sin(facing), np.cos(tilt) * np.cos(facing), np.sin(tilt)])
+    right = np.column_stack([-np.cos(facing), np.sin(facing), np.zeros(2)])
+    middle, half = np.array([[0.5, -1.0, 2.4], [2.0, 3.0, 2.8]]), np.array([[0.9, 0.6], [1.4, 1.0]])
+    up = np.cross(normal, right)
+    onto = random.uniform(-1.6, 1.6, (2, 8_000, 3)) * [1.0, 1.0, 0.2]  # many rays end at a plate
+    for k in range(2):
+        ends[8_000 * k : 8_000 * (k + 1)] = middle[k] + onto[k] @ np.stack([right[k], up[k], normal[k]])
+    starts[3], ends[4] = np.nan, starts[4]
+    reach_m, limits = 6.0, (0.08, 1.0, 0.1, 0.5, 0.2)
+    thick, far, least, most, cosine = limits
+    counts = np.zeros((2, 5, 3), np.int64)
+    plates = np.column_stack([middle, normal, right, half])
+    rays_at_plates(Rays(*np.ascontiguousarray(np.hstack([starts, ends]).T)), plates, reach_m, limits, counts)
+
+    way = ends - starts
+    expected = np.zeros_like(counts)
+    for k in range(2):
+        rate, first, last = way @ normal[k], (starts - middle[k]) @ normal[k], (ends - middle[k]) @ normal[k]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            steep = np.abs(rate) >= cosine * np.linalg.norm(way, axis=1)
+            past = np.where(rate > 0.0, last, -last)
+            told = steep & (np.abs(rate) > 0.0) & (past >= -thick) & (np.where(rate > 0.0, first, -first) <= -thick)
+            told &= np.hypot(*(ends - middle[k])[:, :2].T) <= reach_m
+            meets = ends - np.where(past > thick, last / rate, 0.0)[:, None] * way - middle[k]
+        u, v = meets @ right[k], meets @ up[k]
+        (wide, tall), beside, beyond = half[k], np.abs(u) - half[k, 0], np.abs(v) - half[k, 1]
+        strip_u, strip_v = (beside > least) & (beside <= most), (beyond > least) & (beyond <= most)
+        level, upright = np.abs(v) <= tall, np.abs(u) <= wide
+        parts = (level & upright, level & strip_u & (u < 0), level & strip_u & (u > 0), upright & strip_v & (v > 0),
+                 upright & strip_v & (v < 0))  # fmt: skip
+        for part, own in enumerate(parts):
+            for sort, some in enumerate((past <= thick, (past > thick) & (past <= far), past > far)):
+                expected[k, part, sort] = np.count_nonzero(told & own & some)
+    assert expected.min() > 5
     assert counts.tolist() == expected.tolist()

@@ -235,3 +235,63 @@ def _count_at(rays, i, way, shaft, reach_m, limits_m, counts):
         counts[part, 1] += 1
     elif part >= 0 and length - along >= -radius - before:
         counts[part, 0] += 1
+
+
+@kernel
+def rays_at_plates(rays, plates, reach_m, limits, counts):
+    """Count the rays at upright plates: those that end in the plane, close behind it, and far behind it.
+
+    A ray counts from either side. One that ends before the plane, or that grazes it, tells nothing.
+
+    Parameters
+    ----------
+    rays : Rays; those of no length, and those whose beginning is not known, are left out.
+    plates : (p, 11) x, y, height of the middle, unit vectors along the normal and to the right, half the width and half
+        the height (m); up is across both.
+    reach_m : rays that end farther from the middle, seen from above, do not count.
+    limits : how far off the plane a ray ends in it, and from where on it ends far behind it; inner and outer edge of
+        the strips around the plate, from its outline (m); least cosine between a ray and the normal.
+    counts : (p, 5, 3) int64, added to: rays at the plate, at the strips on its left, on its right, above, below; those
+        that end in the plane, close behind it, far behind it.
+    """
+    thick, far, least, most, cosine = limits
+    for i in range(rays.from_x.size):
+        way_x, way_y = rays.to_x[i] - rays.from_x[i], rays.to_y[i] - rays.from_y[i]
+        way_z = rays.to_height[i] - rays.from_height[i]
+        length = math.sqrt(way_x * way_x + way_y * way_y + way_z * way_z)
+        if not length > 0.0:
+            continue
+        for k in range(len(plates)):
+            normal_x, normal_y, normal_z = plates[k, 3], plates[k, 4], plates[k, 5]
+            x, y, z = rays.to_x[i] - plates[k, 0], rays.to_y[i] - plates[k, 1], rays.to_height[i] - plates[k, 2]
+            rate = way_x * normal_x + way_y * normal_y + way_z * normal_z
+            behind = x * normal_x + y * normal_y + z * normal_z
+            if rate < 0.0:
+                rate, behind = -rate, -behind
+            if behind < -thick or rate < cosine * length or behind - rate > -thick or math.hypot(x, y) > reach_m:
+                continue
+            if behind > thick:
+                x, y, z = (x - way_x * behind / rate, y - way_y * behind / rate, z - way_z * behind / rate)
+            right_x, right_y, right_z = plates[k, 6], plates[k, 7], plates[k, 8]
+            right = x * right_x + y * right_y + z * right_z
+            up = (
+                x * (normal_y * right_z - normal_z * right_y)
+                + y * (normal_z * right_x - normal_x * right_z)
+                + z * (normal_x * right_y - normal_y * right_x)
+            )
+            part = _part_of_plate(right, up, plates[k, 9], plates[k, 10], least, most)
+            if part >= 0:
+                counts[k, part, 0 if behind <= thick else (1 if behind <= far else 2)] += 1
+
+
+@inlined
+def _part_of_plate(right, up, wide, tall, least, most):
+    """Part of a plate and the strips around it in which a place lies; −1: none."""
+    if abs(up) <= tall:
+        past = abs(right) - wide
+        if past <= 0.0:
+            return 0
+        return (2 if right > 0.0 else 1) if least < past <= most else -1
+    if abs(right) <= wide and least < abs(up) - tall <= most:
+        return 3 if up > 0.0 else 4
+    return -1

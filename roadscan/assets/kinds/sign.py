@@ -22,7 +22,7 @@ from roadscan.assets.quantiles import median, quantiles
 from roadscan.assets.scene import Scene, once_a_scene
 from roadscan.assets.upright.brightness import brightness
 from roadscan.assets.upright.pieces import Place, objects_at_places, pieces_of, schema_of
-from roadscan.assets.upright.plate_beams import beams_of
+from roadscan.assets.upright.plate_beams import beams_of, sight_at
 from roadscan.assets.upright.plate_outlines import Outline, PlaneOfPlate, Spot, features_of, outline_of
 from roadscan.assets.upright.regions import on_thin, regions_of
 from roadscan.assets.upright.shafts import shafts_of
@@ -61,13 +61,15 @@ _MOST_OF_POST: Final = 0.6
 """Where more of the plate's returns than this share stand over what goes on beyond it, that is no post."""
 _RIM_SHARE: Final = 0.7
 """Beside returns of full brightness those of this share of it belong to a plate: spots at its rim, dark symbols."""
+_LOOKED_AT: Final = 0.85
+"""Plates of this share of the least size are still looked at; the side of a post that shows 2 σ less is none."""
 _SAME_PLATE: Final = 0.3
 """Of candidates that share so many of their returns the most probable one is kept."""
 _SPOT_SHARE: Final = 0.25
 """1 σ of where within its spot the middle of a beam lies that a plate just stops, as a share of half the spot."""
 _USUAL_HALF_RAD: Final = math.radians(0.17 / 2.0)
 """Half the angle of a beam whose width is not known (rad): that of common spinning lidars."""
-JUDGE: Final = Judge("sign", "00c8eb2b7c050222")
+JUDGE: Final = Judge("sign", "82d20c25ece54bb4")
 
 
 class SignOptions(KindOptions):
@@ -129,7 +131,26 @@ def candidates_of(scene: Scene, options: SignOptions) -> list[Plate]:
     found = [one for one in found if sure[one.rows].sum() >= _LEAST_BRIGHT]
     thin = on_thin(scene) & free & (scene.above_ground_m > _SEARCHED_ABOVE_M)
     found += _plates(scene, np.flatnonzero(thin), bright, options)
-    return sorted((p for p in found if not _on_thick_shaft(scene, p)), key=lambda p: p.middle_m)
+    found = sorted((p for p in found if not _on_thick_shaft(scene, p)), key=lambda p: p.middle_m)
+    return _with_sight(scene, found)
+
+
+def _with_sight(scene: Scene, found: list[Plate]) -> list[Plate]:
+    """Returns plates with the features of the sight lines at them."""
+    if not found:
+        return []
+    lie = [(p.middle_m, _unit_vectors(p.facing_deg, p.tilt_deg), p.outline) for p in found]
+    table = np.array([[*middle, *axes, shape.width_m / 2, shape.height_m / 2] for middle, axes, shape in lie])
+    sight = sight_at(scene, table)
+    return [replace(p, features={**p.features, **{name: float(values[k]) for name, values in sight.items()}})
+            for k, p in enumerate(found)]  # fmt: skip
+
+
+def _unit_vectors(facing_deg: float, tilt_deg: float) -> Float64:
+    """Returns the unit vectors along the normal and to the right (6,) of a plate."""
+    facing, tilt = math.radians(facing_deg), math.radians(tilt_deg)
+    flat = np.array([math.sin(facing), math.cos(facing)])
+    return np.array([*(math.cos(tilt) * flat), math.sin(tilt), -flat[1], flat[0], 0.0])
 
 
 def _plates(scene: Scene, rows: Int64, bright: Bool, options: SignOptions) -> list[Plate]:
@@ -261,6 +282,8 @@ def _plate(scene: Scene, cluster: Int64, bright: Bool, options: SignOptions) -> 
     beams = beams_of(scene, _without_post(scene, edge, PlaneOfPlate(rows, near, middle, normal, right, up)), rows,
                      middle, (right, up))  # fmt: skip
     outline = outline_of(np.column_stack([placed @ right, placed @ up]), beams, _spot(scene, edge))
+    if min(outline.width_m, outline.height_m) + 2.0 * outline.sigma_m < _LOOKED_AT * options.least_size_m:
+        return None
     place = middle + outline.middle[0] * right + outline.middle[1] * up
     above = float(place[2]) - ground
     plane = PlaneOfPlate(rows, near, place, normal, right, up)
@@ -368,7 +391,7 @@ def _wide(scene: Scene, rows: Int64, middle: Float64, normal: Float64) -> Int64:
 
 
 def _has_size(outline: Outline, options: SignOptions) -> bool:
-    least = 0.85 * options.least_size_m
+    least = _LOOKED_AT * options.least_size_m
     small, large = sorted((outline.width_m, outline.height_m))
     return least <= small and large <= options.greatest_board_m
 

@@ -1,4 +1,9 @@
-"""Beams at the plane of a plate: those that it stopped, and those that passed."""
+"""Beams at the plane of a plate: those that it stopped, and those that passed.
+
+A sign stands free, so that lines of sight pass beside, above and below it and end far behind. The front of a house, a
+window in it and the rear of a van go on beside what looks like a plate, or something lies close behind it. Lines show
+that without any class of what stands there.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +13,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from roadscan.assets.kernels.sight import Rays, rays_near
-from roadscan.assets.scene import Scene, once_a_scene
+from roadscan.assets.kernels.sight import Rays, rays_at_plates, rays_near
+from roadscan.assets.scene import LINES_M, Scene, once_a_scene
 from roadscan.assets.upright.brightness import brightness
 from roadscan.compute.array_types import Bool, Float64, Int64
+from roadscan.compute.kernel_options import read_only
 
 _LEAST_COSINE: Final = 0.3
 """Least cosine between a beam and the normal: grazing beams show poorly where they meet the plane."""
@@ -34,6 +40,12 @@ _LEAST_LIGHT: Final = 0.05
 """Plates are at least so bright, as a multiple of upright things."""
 _LEAST_GAP: Final = 1e-4
 """Lasers nearer to one another (rad) draw the same line."""
+_SIGHT_LIMITS: Final = (0.08, 1.0, 0.08, 0.5, 0.2)
+"""Lines end in the plane within the first distance of it; what they find beyond the second is nothing of the plate, for
+a wall, a box or a van is nearer; strips around a plate lie between the next two distances from its outline (m); lines
+whose cosine to the normal is less than the last show poorly where they meet the plane."""
+_LEAST_LINES: Final = 6
+"""Fewer lines at a strip tell nothing."""
 
 
 class Beams(NamedTuple):
@@ -329,3 +341,28 @@ def _beside_lasers(fan: _Fan) -> tuple[Float64, Float64, Float64]:
         way.append(np.cos(turn) * fan.way[line] + np.sin(turn) * aside)
         half.append(fan.half_rad[line])
     return np.concatenate(sensor), np.concatenate(way), np.concatenate(half)
+
+
+def sight_at(scene: Scene, plates: Float64) -> dict[str, Float64]:
+    """Returns features (p,) of the sight lines at plates (p, 11), as the kernel has them; NaN where too few tell it.
+
+    `open_top` and `open_below` are the shares of the lines above and below that end far behind the plane, `open_less`
+    the smaller one of both sides and `open_more` the greater one. `backed` is the share of the lines about the plate,
+    and at it, that end close behind the plane, `level` that of the lines about it that end in the plane.
+    """
+    returns = scene.returns
+    ends = returns.sensor_x_m, returns.sensor_y_m, returns.sensor_height_m, returns.x_m, returns.y_m, returns.height_m
+    counts = np.zeros((len(plates), 5, 3), np.int64)
+    for lines in (ends, scene.beyond_m):
+        rays_at_plates(Rays(*map(read_only, lines)), plates, LINES_M, _SIGHT_LIMITS, counts)
+    left, right, top, below = (_share(counts[:, k], 2) for k in range(1, 5))
+    return {
+        "open_more": np.fmax(left, right), "open_less": np.minimum(left, right), "open_top": top, "open_below": below,
+        "backed": _share(counts.sum(axis=1), 1), "level": _share(counts[:, 1:].sum(axis=1), 0),
+    }  # fmt: skip
+
+
+def _share(some: Int64, which: int) -> Float64:
+    """Returns the share (n,) of one sort of lines (n, 3); NaN of too few."""
+    every = some.sum(axis=1)
+    return np.where(every >= _LEAST_LINES, some[:, which] / np.maximum(every, 1), np.nan)

@@ -411,8 +411,6 @@ def features_of(
         "residual_m": residual_m, "beside": beside,
         "behind": float((inside & (away > _THIN_M) & (away < _BEHIND_M)).sum()) / number,
         "around": float(around.sum()) / number, "on_top": float(on_top.sum()) / number,
-        "below": float(below.sum()) / number,
-        "below_wide": float(np.std(u[below])) / outline.width_m if below.sum() >= 5 else math.nan,
         "green": float(green.mean()) if green.size >= 5 else math.nan,
         "above_m": above_m, "width_m": outline.width_m, "height_m": outline.height_m,
         "ratio": math.log(outline.height_m / outline.width_m),

@@ -106,7 +106,7 @@ class AssetKind(ABC):
     sees_green: ClassVar[bool] = False
     """Whether it uses the green ground of pictures (:meth:`with_pictures`)."""
     sees_paint: ClassVar[bool] = False
-    """Whether it uses the paint that pictures show, likewise."""
+    """Whether it uses the paint that pictures show, likewise: its pieces are those of lane lines or of markings."""
 
     @abstractmethod
     def evidence(self, scene: Scene, options: Any) -> Evidence:

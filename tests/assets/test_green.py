@@ -12,11 +12,12 @@ import shapely
 from roadscan.assets.edges.along_drive import BESIDE_PIECES
 from roadscan.assets.green import colours
 from roadscan.assets.green.areas import GREEN_CELLS, Sums, green_rows, mosaic_of
-from roadscan.assets.green.cells import CELL_M
+from roadscan.assets.green.cells import CELL_M, ground_cells
 from roadscan.assets.green.colours import FINE, FINE_M, Ground, Look, PlacedGround, greenness, linear
 from roadscan.assets.kinds.landscape_area import PIECE_SCHEMA, WHOLE, LandscapeArea, LandscapeOptions
 from roadscan.assets.kinds.road_edge import RoadEdge
 from roadscan.assets.kinds.sidewalk import Sidewalk
+from roadscan.assets.scene import Box, GroundModel, Returns, Scene
 
 ASPHALT, GRASS, DRY = (120, 119, 116), (76, 100, 50), (100, 96, 66)
 EDGE_M = 3.1
@@ -221,3 +222,34 @@ def test_a_sidewalk_ends_at_a_flush_lawn() -> None:
 
 def test_green_cells_have_the_columns_of_landscape_areas() -> None:
     assert GREEN_CELLS.names[: len(PIECE_SCHEMA.names)] == PIECE_SCHEMA.names
+
+
+def test_ground_without_returns_is_dated_by_the_nearest_one() -> None:
+    """Two passes saw one half each of a square of 6 m, and neither what lies between them."""
+    random = np.random.default_rng(1)
+    x, y = random.uniform(0.0, 6.0, (2, 4000))
+    seen = np.abs(x - 3.0) > 1.0
+    x, y, n = x[seen], y[seen], np.count_nonzero(seen)
+    number, byte, zeros = (x > 3.0).astype(np.uint16), np.zeros(n, np.uint8), np.zeros(n)
+    returns = Returns(
+        (0.0, 0.0), x, y, zeros, np.ones(n, np.float32), np.where(number == 1, 900, 500), number, byte,
+        np.zeros(n, np.uint16), byte + np.uint8(1), byte + np.uint8(1), zeros, zeros, zeros + 2.0,
+    )  # fmt: skip
+    flat, box = GroundModel(0.0, 0.0, 1.0, np.zeros((6, 6), np.float32), np.ones((6, 6), np.bool_)), Box(0, 0, 6, 6)
+    drive = np.array([[3.0, 0.0, 0.0, 0.0], [3.0, 6.0, 0.0, 0.0]])
+    cells = ground_cells(Scene(returns, box, box, flat, np.zeros(n, np.float32), byte, drive)).to_pylist()
+    assert len(cells) == 24 * 24
+    assert sum(one["returns"] == 0 for one in cells) >= 24 * 8
+    for one in cells:
+        east = (one["column"] + 0.5) * CELL_M > 3.0
+        assert one["passes"] == [int(east)]
+        assert one["first_epoch_gps_ns"] == one["last_epoch_gps_ns"] == (900 if east else 500)
+
+
+def test_more_pictures_than_a_byte_counts_are_many() -> None:
+    """A vehicle that waits at a light is seen by hundreds: their number stays the greatest."""
+    sums = Sums(1)
+    look = Look(np.array([0]), np.full((1, FINE * FINE), 0.1), np.array([0.02]), *NO_COLOURS)
+    for _ in range(257):
+        sums.add(look, 0)
+    assert (sums.number[0] == 255).all()

@@ -34,4 +34,6 @@ def test_pictures_add_lines_to_products_where_intensity_is_noise(tmp_path: Path)
     assert both.marking_f1 > alone.marking_f1
     assert (own["returns"] > 0).all()
     assert (lines["returns"] == 0).any()
+    assert (lines["first_epoch_gps_ns"] >= own["first_epoch_gps_ns"].min()).all()
+    assert (lines["passes"] > 0).all()
     assert float(np.sqrt(np.mean(both.aside_m**2))) < 2.0 * float(np.sqrt(np.mean(both.aside_sigma_m**2)))

@@ -69,7 +69,8 @@ class Sums:
         self.weight[half, look.cells] += weight
         self.greenness[half, look.cells] += weight * index
         self.green[half, look.cells] += weight * (index >= _GREEN)
-        self.number[half, look.cells] += told
+        number = self.number[half, look.cells]
+        self.number[half, look.cells] = np.where(told & (number < 255), number + 1, number)
         own = weight.max(axis=1)
         self.pixel[half, look.cells] += own * look.pixel_m
         self.looks[half, look.cells] += own

@@ -10,7 +10,8 @@ import scipy.spatial
 
 from roadscan.assets import classes
 from roadscan.assets.bins import cells_of, in_bins
-from roadscan.assets.scene import Scene
+from roadscan.assets.scene import Returns, Scene
+from roadscan.compute.array_types import Float64, Int64
 
 CELL_M: Final = 0.25
 """Edge of a cell (m), as of landscape areas; corners are multiples of it in the map."""
@@ -44,31 +45,51 @@ def ground_cells(scene: Scene) -> pa.Table:
         np.column_stack([x, y]), distance_upper_bound=FARTHEST_M
     )
     height = scene.ground.height_at(x, y)
-    held = np.flatnonzero(np.isfinite(away) & np.isfinite(height))
+    known = np.flatnonzero(np.isfinite(away) & np.isfinite(height))
     number = np.full(row.size + 1, -1, np.int32)
-    number[held] = np.arange(held.size)
+    number[known] = np.arange(known.size)
     grid = (tile.x_min_m, tile.y_min_m, CELL_M)
     above, codes = scene.above_ground_m, scene.classes
     noise = np.isin(codes, (classes.LOW_NOISE, classes.HIGH_NOISE))
     stands = np.flatnonzero((above >= _STANDS_M[0]) & (above <= _STANDS_M[1]) & ~noise)
-    standing, _ = in_bins(number[cells_of(returns.x_m[stands], returns.y_m[stands], grid, shape)], held.size)
+    standing, _ = in_bins(number[cells_of(returns.x_m[stands], returns.y_m[stands], grid, shape)], known.size)
     low = np.flatnonzero((above >= _LOW_M[0]) & (above <= _LOW_M[1]) & ~noise)
-    starts, order = in_bins(number[cells_of(returns.x_m[low], returns.y_m[low], grid, shape)], held.size)
+    if not low.size:
+        return GROUND_CELLS.empty_table()
+    starts, order = in_bins(number[cells_of(returns.x_m[low], returns.y_m[low], grid, shape)], known.size)
     rows, count = low[order], np.diff(starts)
     total = np.concatenate([[0.0], np.cumsum(returns.intensity[rows].astype(np.float64))])
     epochs, passes = returns.epoch_gps_ns[rows], returns.pass_id[rows]
     spans = list(zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True))
+    first = [int(epochs[a:b].min()) if b > a else 0 for a, b in spans]
+    last = [int(epochs[a:b].max()) if b > a else 0 for a, b in spans]
+    seen_by = [np.unique(passes[a:b]).tolist() for a, b in spans]
+    # What pictures show where no return lies is dated by the return nearest to it.
+    dark = np.flatnonzero(count == 0)
+    for k, near in zip(
+        dark.tolist(), _nearest(returns, low, np.column_stack([x, y])[known][dark]).tolist(), strict=True
+    ):
+        first[k] = last[k] = int(returns.epoch_gps_ns[near])
+        seen_by[k] = [int(returns.pass_id[near])]
     east, north = (round((returns.corner_m[k] + (tile.x_min_m, tile.y_min_m)[k]) / CELL_M) for k in (0, 1))
     with np.errstate(invalid="ignore", divide="ignore"):
         intensity = (total[starts[1:]] - total[starts[:-1]]) / count
     return pa.table(
         {
-            "column": east + column[held], "row": north + row[held], "height_m": height[held],
+            "column": east + column[known], "row": north + row[known], "height_m": height[known],
             "intensity": intensity.astype(np.float32), "returns": count.astype(np.int32),
-            "drive_m": away[held].astype(np.float32), "stands": np.diff(standing) >= _STANDING,
-            "passes": pa.array([np.unique(passes[a:b]).tolist() for a, b in spans], pa.list_(pa.int32())),
-            "first_epoch_gps_ns": np.array([int(epochs[a:b].min()) if b > a else 0 for a, b in spans], np.int64),
-            "last_epoch_gps_ns": np.array([int(epochs[a:b].max()) if b > a else 0 for a, b in spans], np.int64),
+            "drive_m": away[known].astype(np.float32), "stands": np.diff(standing) >= _STANDING,
+            "passes": pa.array(seen_by, pa.list_(pa.int32())),
+            "first_epoch_gps_ns": np.array(first, np.int64), "last_epoch_gps_ns": np.array(last, np.int64),
         },
         GROUND_CELLS,
     )  # fmt: skip
+
+
+def _nearest(returns: Returns, low: Int64, places_m: Float64) -> Int64:
+    """Returns the rows (n,) of returns nearest to places (n, 2), among one of each cell that holds any."""
+    xy = np.column_stack([returns.x_m[low], returns.y_m[low]])
+    cell = np.floor(xy / CELL_M).astype(np.int64)
+    _, one = np.unique(cell[:, 1] * 1_000_003 + cell[:, 0], return_index=True)
+    _, near = scipy.spatial.cKDTree(xy[one]).query(places_m)
+    return np.asarray(low[one[near]], np.int64)

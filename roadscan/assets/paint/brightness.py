@@ -75,7 +75,7 @@ class BrightSums:
         self.contrast[cells] += weight * value
         self.square[cells] += weight * value**2
         self.bright[cells] += weight * (value >= BRIGHT)
-        self.number[cells] += known
+        self.number[cells] += known & (self.number[cells] < 255)
         self.level[cells] += weight * np.nan_to_num(seen.level)
 
 

@@ -107,7 +107,7 @@ def plan_green(plan: AssetPlan, manifest: Manifest) -> GreenPlan:
         near = pictures.near(_box(plan.grid, square))
         if len(near):
             read = [[r.digest for _, r in _around(plan.grid, square, some)] for some in (ground, screens)]
-            read.append([record.digest for _, record in _paint_around(square, paint)])
+            read.append([record.digest for _, record in _paint_around(plan.grid, square, paint)])
             keys[square] = key_of(code, near.key(), read, plan.grid.edge_m)
     return GreenPlan(keys, pictures)
 
@@ -124,7 +124,7 @@ def green_tasks(plan: AssetPlan, green: GreenPlan, manifest: Manifest, workers: 
         tasks.append(
             GreenTask(plan.survey.store, plan.grid, tuple((s, green.keys[s]) for s in squares),
                       tuple(read[0].items()), tuple(read[1].items()),
-                      tuple(dict.fromkeys(one for s in squares for one in _paint_around(s, paint))), near)
+                      tuple(dict.fromkeys(one for s in squares for one in _paint_around(plan.grid, s, paint))), near)
         )  # fmt: skip
     return tasks
 
@@ -145,9 +145,10 @@ def _paint(plan: AssetPlan, manifest: Manifest) -> list[tuple[TileId, OutputReco
 
 
 def _paint_around(
-    square: TileId, paint: Sequence[tuple[TileId, OutputRecord]]
+    grid: AssetGrid, square: TileId, paint: Sequence[tuple[TileId, OutputRecord]]
 ) -> Sequence[tuple[TileId, OutputRecord]]:
-    return [one for one in paint if abs(one[0].column - square.column) <= 1 and abs(one[0].row - square.row) <= 1]
+    rings = math.ceil(_MARGIN_M / grid.edge_m)
+    return [one for one in paint if max(abs(one[0].column - square.column), abs(one[0].row - square.row)) <= rings]
 
 
 def _box(grid: AssetGrid, square: TileId, beyond_m: float = _MARGIN_M) -> Bounds:
@@ -213,7 +214,7 @@ def _found(
             sums.add(look, int(bytes_digest(near.name(number).encode())[-1], 16) & 1)
             bright.add(look.cells, brightness_in(look.colour, look.shown, look.cells, cells), look.pixel_m)
             shown_by += 1
-    known = [recorded_table(task.store, record) for _, record in _paint_around(square, task.paint)]
+    known = [recorded_table(task.store, record) for _, record in _paint_around(task.grid, square, task.paint)]
     window, box = _window(task.grid, square, cells, rows, known)
     mosaic = mosaic_of(sums, window.cell, window.at, window.shape, cells.drive_m[window.cell])
     first = round(window.corner_m[1] / CELL_M), round(window.corner_m[0] / CELL_M)

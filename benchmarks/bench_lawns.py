@@ -5,32 +5,23 @@ Street 2 was looked at; 12 and 13 are only scored.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from benchmarks.labelled_street import run
-from benchmarks.lawn_streets import drawn, score
+from benchmarks.lawn_streets import drawn, score, with_and_without_pictures
 from benchmarks.timing import Figure
 
 STREETS: Final = {2: "looked at", 12: "only scored", 13: "only scored"}
-_SETTINGS: Final = {"returns alone": "[assets.pictures]\non = false\n", "with pictures": ""}
 
 
 def figures(folder: Path) -> Iterator[Figure]:
     """Each street, by returns alone and with pictures."""
     for seed, seen in STREETS.items():
         street = folder / f"lawns {seed}"
-        text = drawn(seed, street).read_text()
-        for name, settings in _SETTINGS.items():
-            own = folder / f"lawns {seed} {name}"
-            shutil.copytree(street, own)
-            file = own / "SURVEY.toml"
-            file.write_text(f"{text}\n[assets]\n{settings}")
-            run(file)
+        for name, file in with_and_without_pictures(drawn(seed, street), folder):
             found, what = score(street, file), f"street {seed} ({seen}), {name}"
             yield Figure(f"{what}: lawn found", found.found, "")
             yield Figure(f"{what}: of what is found, right", found.right, "")

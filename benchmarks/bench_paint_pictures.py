@@ -5,14 +5,13 @@ Streets 1 and 3 were looked at; 21 and 22 are only scored.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from benchmarks.labelled_street import run
+from benchmarks.lawn_streets import with_and_without_pictures
 from benchmarks.paint_streets import drawn, score
 from benchmarks.settings import bench_folder
 from benchmarks.timing import Figure
@@ -22,7 +21,6 @@ STREETS: Final = (
 )  # fmt: skip
 """Seed and lidar."""
 LOOKED_AT: Final = {1, 3}
-_SETTINGS: Final = {"returns alone": "[assets.pictures]\non = false\n", "with pictures": ""}
 
 
 def figures(folder: Path) -> Iterator[Figure]:
@@ -30,13 +28,7 @@ def figures(folder: Path) -> Iterator[Figure]:
     for seed, model in STREETS:
         seen = "looked at" if seed in LOOKED_AT else "only scored"
         street = bench_folder(folder) / f"paint {seed} {model}"
-        text = drawn(seed, model, street).read_text()
-        for name, settings in _SETTINGS.items():
-            own = folder / f"paint {seed} {model} {name}"
-            shutil.copytree(street, own)
-            file = own / "SURVEY.toml"
-            file.write_text(f"{text}\n[assets]\n{settings}")
-            run(file)
+        for name, file in with_and_without_pictures(drawn(seed, model, street), folder):
             found, what = score(street, file), f"street {seed}, {model} ({seen}), {name}"
             yield Figure(f"{what}: painted length of lines found", found.found, "", found.line_m, "m of paint")
             yield Figure(f"{what}: painted length whose pattern is right", found.pattern, "")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
@@ -76,6 +77,13 @@ class Sums:
         self.looks[half, look.cells] += own
 
 
+def in_raster(values: npt.NDArray[Any], at: tuple[Int64, Int64], shape: tuple[int, int]) -> Any:
+    """Returns a raster of fine cells from values (n, 25) of cells at rows and columns of a window of `shape` cells."""
+    out = np.zeros((*shape, FINE, FINE), values.dtype)
+    out[at] = values.reshape(-1, FINE, FINE)
+    return np.ascontiguousarray(out.transpose(0, 2, 1, 3).reshape(shape[0] * FINE, shape[1] * FINE))
+
+
 def mosaic_of(sums: Sums, own: Int64, at: tuple[Int64, Int64], shape: tuple[int, int], drive_m: Float64) -> Mosaic:
     """Returns fine cells of a window from the sums of its cells.
 
@@ -84,11 +92,7 @@ def mosaic_of(sums: Sums, own: Int64, at: tuple[Int64, Int64], shape: tuple[int,
     """
     sums = sums.at(own)
 
-    def raster(values: npt.NDArray[Any]) -> Any:
-        out = np.zeros((*shape, FINE, FINE), values.dtype)
-        out[at] = values.reshape(-1, FINE, FINE)
-        return np.ascontiguousarray(out.transpose(0, 2, 1, 3).reshape(shape[0] * FINE, shape[1] * FINE))
-
+    raster = functools.partial(in_raster, at=at, shape=shape)
     weight = raster(sums.weight.sum(axis=0))
     some = np.maximum(weight, 1e-9)
     index, share = raster(sums.greenness.sum(axis=0)) / some, raster(sums.green.sum(axis=0)) / some

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from roadscan.assets.green.colours import FINE, Ground
 from roadscan.compute.array_types import Bool, Float64, Int64, UInt8
@@ -77,10 +76,3 @@ class BrightSums:
         self.bright[cells] += weight * (value >= BRIGHT)
         self.number[cells] += known & (self.number[cells] < 255)
         self.level[cells] += weight * np.nan_to_num(seen.level)
-
-
-def in_raster(values: npt.NDArray[Any], at: tuple[Int64, Int64], shape: tuple[int, int]) -> Any:
-    """Returns a raster of fine cells from values (n, 25) of cells at rows and columns of a window of `shape` cells."""
-    out = np.zeros((*shape, FINE, FINE), values.dtype)
-    out[at] = values.reshape(-1, FINE, FINE)
-    return np.ascontiguousarray(out.transpose(0, 2, 1, 3).reshape(shape[0] * FINE, shape[1] * FINE))

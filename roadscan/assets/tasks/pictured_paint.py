@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
@@ -10,10 +11,11 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
+from roadscan.assets.green.areas import in_raster
 from roadscan.assets.green.cells import CELL_M
 from roadscan.assets.green.colours import FINE, FINE_M, Ground
 from roadscan.assets.kinds.road_marking import PATCH_PIECES, type_and_symbol
-from roadscan.assets.paint.brightness import BRIGHT, BrightSums, in_raster
+from roadscan.assets.paint.brightness import BRIGHT, BrightSums
 from roadscan.assets.paint.components import Component, Contrast, components_of
 from roadscan.assets.paint.detection import LINE_PIECES, Patch, covers, line_outlines, sorted_paint, within
 from roadscan.assets.paint.stripes import RoadDirection, Stripe
@@ -91,6 +93,17 @@ class Window:
     """Their rows in the table of the ground, as those of `ground`."""
     corner_m: tuple[float, float]
     known: Known
+
+    @functools.cached_property
+    def _tree(self) -> Any:
+        from scipy.spatial import cKDTree
+
+        row, column = self.at
+        return cKDTree(np.column_stack([(column + 0.5) * CELL_M, (row + 0.5) * CELL_M]))
+
+    def nearest(self, x: Any, y: Any) -> Int64:
+        """Returns the cells of the ground nearest to places (n,) of the window (m, from its corner)."""
+        return np.asarray(self.cell[self._tree.query(np.column_stack([x, y]))[1]])
 
     def cells(self, values: Any, fill: float) -> Any:
         """Returns a raster of values (n,) of the ground's cells."""
@@ -362,21 +375,12 @@ def _rows(shape: Stripe | Patch, window: Window, box: Box) -> list[dict[str, Any
     return [{"line": None, "patch": patch}]
 
 
-def _nearest(window: Window, x: Any, y: Any) -> Int64:
-    """Returns the cells of the ground nearest to places (n,) of a window."""
-    from scipy.spatial import cKDTree
-
-    row, column = window.at
-    cells = np.column_stack([(column + 0.5) * CELL_M, (row + 0.5) * CELL_M])
-    return np.asarray(window.cell[cKDTree(cells).query(np.column_stack([x, y]))[1]])
-
-
 def _height(window: Window, x: Float64, y: Float64) -> Float64:
-    return np.asarray(window.ground.height_m[_nearest(window, x, y)])
+    return np.asarray(window.ground.height_m[window.nearest(x, y)])
 
 
 def _near(window: Window, x: float, y: float) -> dict[str, Any]:
     """Returns the passes and epochs of the cell nearest to a place that returns show."""
-    cell = int(_nearest(window, [x], [y])[0])
+    cell = int(window.nearest([x], [y])[0])
     row = window.rows.select(["passes", "first_epoch_gps_ns", "last_epoch_gps_ns"]).slice(cell, 1).to_pylist()[0]
     return {"returns": 0, **row}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -49,6 +51,13 @@ def ground(intensity: np.ndarray) -> Ground:
     return Ground(column, row, none, intensity, drive_m, none > 0.0, np.zeros((row.size, 2)))
 
 
+def rows_of(returns: np.ndarray) -> pa.Table:
+    return pa.table({
+        "returns": returns, "passes": pa.array([[1]] * returns.size, pa.list_(pa.int32())),
+        "first_epoch_gps_ns": np.full(returns.size, 5), "last_epoch_gps_ns": np.full(returns.size, 9),
+    })  # fmt: skip
+
+
 def window(lidar: float | None, pieces: Sequence[pa.Table] = ()) -> Window:
     """The window, whose paint raises the lidar's intensity by a share; None: no returns."""
     random, count = np.random.default_rng(4), SIDE**2
@@ -56,10 +65,7 @@ def window(lidar: float | None, pieces: Sequence[pa.Table] = ()) -> Window:
     intensity = 40.0 * (1.0 + (lidar or 0.0) * shares().mean(axis=1)) * random.normal(1.0, 0.08, count)
     intensity[~hit | (lidar is None)] = np.nan
     returns = np.where(np.isfinite(intensity), 2, 0)
-    rows = pa.table({
-        "returns": returns, "passes": pa.array([[1]] * count, pa.list_(pa.int32())),
-        "first_epoch_gps_ns": np.full(count, 5), "last_epoch_gps_ns": np.full(count, 9),
-    })  # fmt: skip
+    rows = rows_of(returns)
     own, cells = np.arange(count), ground(intensity)
     return Window(
         own, (cells.row, cells.column), (SIDE, SIDE), cells, rows, (500.0, 900.0), Known.of(pieces, (500.0, 900.0))
@@ -154,13 +160,64 @@ def test_squares_share_a_line_without_gap_or_overlap() -> None:
     assert max(max(one["begin_y_m"], one["end_y_m"]) for one in parts[0]) == pytest.approx(904.4, abs=1e-6)
 
 
+LENGTH, ACROSS, MARGIN = 192, 24, 32
+"""Cells of a longer street along the northings: 48 m by 6 m; squares are seen with 8 m around them."""
+
+
+@functools.cache
+def faded_line() -> tuple[np.ndarray, list[np.ndarray]]:
+    """Intensity of cells and contrasts in three pictures: a faint line on a quiet pavement, then on a noisy one."""
+    row, column = (a.ravel()[:, None] for a in np.indices((LENGTH, ACROSS)))
+    part, random = np.arange(FINE * FINE), np.random.default_rng(11)
+    x_m = column * CELL_M + (part % FINE + 0.5) * FINE_M
+    y_m = row * CELL_M + (part // FINE + 0.5) * FINE_M
+    line = np.clip((WIDTH_M / 2 + FINE_M / 2 - np.abs(x_m - LINE_M)) / FINE_M, 0.0, 1.0) * (y_m > 2.0)
+    noise = np.where(y_m < 10.0, 0.02, 0.35)
+    intensity = 40.0 * (1.0 + line.mean(axis=1)) * random.normal(1.0, 0.08, row.size)
+    return intensity, [random.normal(0.0, noise) + 0.33 * line for _ in range(3)]
+
+
+def paint_of_rows(first: int, last: int) -> pa.Table:
+    """Paint in the box of some rows of cells (first, last) of the longer street."""
+    intensity, pictures = faded_line()
+    row, column = (a.ravel() for a in np.indices((LENGTH, ACROSS)))
+    low, high = max(first - MARGIN, 0), min(last + MARGIN, LENGTH)
+    held = np.flatnonzero((row >= low) & (row < high))
+    row, column, none = row[held], column[held], np.zeros(held.size)
+    drive_m = np.abs((column + 0.5) * CELL_M - 3.0)
+    cells = Ground(column, row, none, intensity[held], drive_m, none > 0.0, np.zeros((held.size, 2)))
+    own, total, corner_m = np.arange(held.size), BrightSums(held.size), (500.0, 900.0 + low * CELL_M)
+    for one in pictures:
+        total.add(own, Seen(one[held], one[held]), np.full(own.size, 0.05))
+    seen = Window(
+        own, (row - low, column), (high - low, ACROSS), cells, rows_of(np.full(own.size, 2)), corner_m,
+        Known.of((), corner_m),
+    )  # fmt: skip
+    return pictured_paint(total, seen, Box(0.0, (first - low) * CELL_M, ACROSS * CELL_M, (last - low) * CELL_M))
+
+
+@pytest.mark.parametrize("cuts", [(60,), (100,), (56, 148)])
+def test_a_line_is_the_same_wherever_squares_are_cut(cuts: tuple[int, ...]) -> None:
+    def ends_m(*cuts: int) -> np.ndarray:
+        """Places where the line begins and ends, without those at cuts."""
+        found = [lines(paint_of_rows(a, b)) for a, b in itertools.pairwise((0, *cuts, LENGTH))]
+        ends = [sorted((one["begin_y_m"], one["end_y_m"])) for part in found for one in part]
+        at_cut = 900.0 + np.array(cuts) * CELL_M
+        return np.array([e for e in np.sort(np.ravel(ends)) if not np.isclose(e, at_cut, atol=1e-6).any()])
+
+    whole = ends_m()
+    assert whole[0] == pytest.approx(902.0, abs=0.05)
+    assert 909.9 < whole[-1] < 940.0
+    np.testing.assert_allclose(ends_m(*cuts), whole, atol=1e-6)
+
+
 @pytest.mark.parametrize("noise", [0.03, 0.1])
 def test_edges_follow_the_noise(noise: float) -> None:
     random = np.random.default_rng(8)
     flat = random.normal(0.0, noise, (120, 120))
-    assert canny_edges(flat, noise).mean() < 0.02
+    assert canny_edges(flat, np.full(flat.shape, noise)).mean() < 0.02
     flat[:, 60:] += 10.0 * noise
-    assert canny_edges(flat, noise)[5:-5, 58:62].any(axis=1).mean() > 0.95
+    assert canny_edges(flat, np.full(flat.shape, noise))[5:-5, 58:62].any(axis=1).mean() > 0.95
 
 
 def test_exposure_and_shade_change_no_contrast_and_a_lit_strip_has_no_level() -> None:

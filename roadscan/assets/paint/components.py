@@ -173,7 +173,7 @@ _EDGE_SHARE: Final = 0.4
 """Paint extends to where the contrast is this share of the greatest near it."""
 _NEAR_M: Final = 0.2  # Distance within which that greatest contrast is sought (m).
 _LEAST_CONTRAST: Final = 0.10  # Least contrast of paint.
-_AROUND_M: Final = 0.3
+AROUND_M: Final = 0.3
 """Returns within this distance of its cells (m) belong to a component's surroundings."""
 FEWEST_RETURNS: Final = 8  # A component needs this many returns …
 FEWEST_LINES: Final = 3  # … on this many scan lines.
@@ -277,11 +277,11 @@ def _nearest(label: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
     """Returns the label of the nearest labelled cell within reach, else 0."""
     from scipy import ndimage
 
-    reach = math.ceil(_AROUND_M / CELL_M) + 1
+    reach = math.ceil(AROUND_M / CELL_M) + 1
     rows, columns = (np.flatnonzero(label.any(axis=axis)) for axis in (1, 0))
     part = tuple(slice(max(int(one[0]) - reach, 0), int(one[-1]) + reach + 1) for one in (rows, columns))
     near = label[part]
     away, at = ndimage.distance_transform_edt(near == 0, return_indices=True)
     out = np.zeros_like(label)
-    out[part] = np.where(away <= _AROUND_M / CELL_M, near[tuple(at)], 0)
+    out[part] = np.where(away <= AROUND_M / CELL_M, near[tuple(at)], 0)
     return out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
@@ -16,7 +17,7 @@ from roadscan.assets.green.cells import CELL_M
 from roadscan.assets.green.colours import FINE, FINE_M, Ground
 from roadscan.assets.kinds.road_marking import PATCH_PIECES, type_and_symbol
 from roadscan.assets.paint.brightness import BRIGHT, BrightSums
-from roadscan.assets.paint.components import Component, Contrast, components_of
+from roadscan.assets.paint.components import AROUND_M, Component, Contrast, components_of
 from roadscan.assets.paint.detection import LINE_PIECES, Patch, covers, line_outlines, sorted_paint, within
 from roadscan.assets.paint.stripes import RoadDirection, Stripe
 from roadscan.assets.paint.symbols import UNKNOWN
@@ -35,11 +36,14 @@ _DULL: Final = 2.5
 """Contrasts below so many σ of the mosaic's noise are no paint."""
 _HALF, _NEAR = 0.5, 7
 """So do those below this share of the greatest contrast in a square of so many fine cells."""
+_PLAIN: Final = 0.2  # Fine cells whose contrast is within this of 0 are bare, and tell the noise …
+_NOISE_M: Final = 4.0
+"""… of the squares of this edge (m) around each place, which lie within a window wherever its cut may fall."""
 _LEAST_NOISE: Final = 0.04  # Least 1 σ of a fine cell's contrast.
 _CANNY: Final = (2.0, 4.0)
 """Thresholds of edges: steps over two fine cells, in units of the noise."""
 _EDGED: Final = 0.6
-"""Share of the outline of a shape that edges have to lie along."""
+"""Share of the outline of a shape, within such a square, that edges have to lie along."""
 _SIGMAS_M: Final = 0.025
 """1 σ of the place of paint in pictures (m) that is common to all: a mounting off by 0.1° at 8 m, and a clock."""
 
@@ -122,12 +126,11 @@ def contrast_of_pictures(sums: BrightSums, window: Window) -> tuple[Contrast, Bo
     some = np.maximum(weight, 1e-9)
     mean = np.where(known, total / some, 0.0)
     spread = np.sqrt(np.maximum(square / some - mean**2, 0.0) / np.maximum(number, 1.0))
-    plain = mean[known & (np.abs(mean) < 0.2)]
-    noise = max(1.4826 * float(np.median(np.abs(plain - np.median(plain)))) if plain.size else 0.0, _LEAST_NOISE)
+    noise = noise_of(mean, known)
     sigma = np.where(known, np.hypot(noise, spread), np.inf)
     smooth = cv2.GaussianBlur(mean, (0, 0), _SMOOTH)
     highest = cv2.dilate(smooth, np.ones((_NEAR, _NEAR), np.uint8))
-    dull = (smooth < np.maximum(max(BRIGHT, _DULL * noise), _HALF * highest)) | (bright / some < _SAME)
+    dull = (smooth < np.maximum(np.maximum(BRIGHT, _DULL * noise), _HALF * highest)) | (bright / some < _SAME)
     agreed = np.where(dull, np.minimum(smooth, 0.0), smooth)
     row, column = np.nonzero(known)
     height = in_raster(_fine_heights(window), window.at, window.shape)
@@ -147,26 +150,44 @@ def _fine_heights(window: Window) -> Float64:
     return np.asarray(window.ground.height_m[window.cell][:, None] + steps)
 
 
-def canny_edges(mean: Float64, noise: float) -> Bool:
+def _around(values: Float64) -> Float64:
+    """Returns sums of values (rows, columns) over the square of 4 m around each fine cell."""
+    size = 2 * round(_NOISE_M / FINE_M / 2) + 1
+    return np.asarray(cv2.boxFilter(values, -1, (size, size), normalize=False, borderType=cv2.BORDER_CONSTANT))
+
+
+def noise_of(mean: Float64, known: Bool) -> Float64:
+    """Returns 1 σ (rows, columns) of the contrasts of the bare cells around each fine cell of a mosaic."""
+    plain = np.where(known & (np.abs(mean) < _PLAIN), mean, np.nan)
+    there, first, second = (_around(np.nan_to_num(v)) for v in (np.isfinite(plain) * 1.0, plain, plain**2))
+    there = np.maximum(there, 1.0)
+    return np.maximum(np.sqrt(np.maximum(second / there - (first / there) ** 2, 0.0)), _LEAST_NOISE)
+
+
+def canny_edges(mean: Float64, noise: Float64) -> Bool:
     """Returns edges (rows, columns) of a mosaic of contrasts, whose thresholds follow its noise."""
-    smooth = cv2.GaussianBlur(mean.astype(np.float32), (3, 3), 0.7)
-    scale = 256.0  # contrasts up to 2 fit into 16 bits, with slopes of eight times that
+    smooth = cv2.GaussianBlur(mean.astype(np.float32), (3, 3), 0.7) / noise
+    scale = 100.0  # contrasts up to 2 are 50 times the least noise; their slopes, of four times that, fit into 16 bits
     steps = [cv2.Sobel(smooth * scale, cv2.CV_16S, x, y, ksize=3) for x, y in ((1, 0), (0, 1))]
-    low, high = (share * noise * 4.0 * scale for share in _CANNY)
+    low, high = (share * 4.0 * scale for share in _CANNY)
     return np.asarray(cv2.Canny(steps[0], steps[1], low, high, L2gradient=True) > 0)
 
 
-def edged(component: Component, edges: Bool) -> float:
-    """Returns the share of the outline of a component along which edges lie."""
-    row, column = np.divmod(component.cell, edges.shape[1])
-    part = np.zeros((int(np.ptp(row)) + 5, int(np.ptp(column)) + 5), np.uint8)
-    part[row - row.min() + 2, column - column.min() + 2] = 1
+def edged(found: Contrast, component: Component, edges: Bool) -> Component | None:
+    """Returns the part of a component around which edges lie along its outline; None without any."""
+    whole = edges.shape
+    row, column = np.divmod(component.cell, whole[1])
+    reach = math.ceil(AROUND_M / FINE_M) + 1
+    first = max(int(row.min()) - reach, 0), max(int(column.min()) - reach, 0)
+    last = min(int(row.max()) + reach + 1, whole[0]), min(int(column.max()) + reach + 1, whole[1])
+    part = np.zeros((last[0] - first[0], last[1] - first[1]), np.uint8)
+    part[row - first[0], column - first[1]] = 1
     outline = (cv2.dilate(part, np.ones((3, 3), np.uint8)) > 0) & (part == 0)
-    r, c = np.nonzero(outline)
-    near = cv2.dilate(edges.view(np.uint8), np.ones((3, 3), np.uint8))
-    r, c = r + row.min() - 2, c + column.min() - 2
-    inside = (r >= 0) & (c >= 0) & (r < edges.shape[0]) & (c < edges.shape[1])
-    return float(near[r[inside], c[inside]].mean()) if inside.any() else 0.0
+    on_edge = outline & edges[first[0] : last[0], first[1] : last[1]]
+    share = _around(on_edge * 1.0) / np.maximum(_around(outline * 1.0), 1.0)
+    near = np.divmod(found.cell[component.near], whole[1])
+    kept, seen = (share[r - first[0], c - first[1]] >= _EDGED for r, c in ((row, column), near))
+    return component.part(kept, seen) if kept.any() else None
 
 
 class LidarLevel:
@@ -225,7 +246,9 @@ class CellDirection(RoadDirection):
 def pictured_paint(sums: BrightSums, window: Window, box: Box) -> pa.Table:
     """Returns rows of `PAINTED`: paint that pictures show in a box of the window (m, from its corner)."""
     found, edges = contrast_of_pictures(sums, window)
-    bright = [one for one in components_of(found) if edged(one, edges) >= _EDGED]
+    edges = cv2.dilate(edges.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    parts = (edged(found, one, edges) for one in components_of(found))
+    bright = [one for one in parts if one is not None]
     if not bright:
         return PAINTED.empty_table()
     mask = np.zeros(edges.shape, np.bool_)

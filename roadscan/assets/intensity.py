@@ -61,6 +61,7 @@ _DOUBT_PLACES: Final = 30.0
 _LEVEL_PRIOR: Final = 0.3
 """Prior 1 σ of the logarithmic gains of range and of incidence, as a root mean square over their nodes: on a level road
 both show the same trend, and a sum of two large ones would pass on the noise of the normals."""
+_FEWEST_OF_CONSTANT: Final = 200  # Places, seen by a laser each, that show that an intensity is always the same.
 _BEND_PRIOR: Final = 0.05
 """Prior 1 σ of the second differences of the functions of range and incidence from node to node."""
 
@@ -213,6 +214,20 @@ def light_of(samples: Sequence[IntensitySample], gains: pa.Table) -> float | Non
     if not values.size:
         return None
     return weighted_quantile(values, weights, 0.5)
+
+
+def constant_intensities(samples: Sequence[IntensitySample]) -> dict[str, float]:
+    """Returns the intensity of each sensor whose returns on the ground all have the same: it is no measurement."""
+    values: dict[str, list[Float64]] = {}
+    for sample in samples:
+        for number in np.unique(sample.sensor).tolist():
+            values.setdefault(sample.sensors[number], []).append(sample.intensity[sample.sensor == number])
+    joined = {sensor: np.concatenate(some) for sensor, some in sorted(values.items())}
+    return {
+        sensor: float(one[0])
+        for sensor, one in joined.items()
+        if one.size >= _FEWEST_OF_CONSTANT and np.ptp(one) <= 1e-6 * abs(one[0])
+    }
 
 
 def log_gains_by_node(gains: pa.Table) -> Callable[[str, str], tuple[Float64, Float64]]:

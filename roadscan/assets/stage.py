@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Final
 
 from roadscan.assets.kind import AssetKind
@@ -34,6 +34,15 @@ ROUGH_READINGS: Final = Witness(
     "Readings or poses scatter by more than the road's own roughness, so that nothing painted is found.",
     f"the scatter of the returns on the ground about their mean height, against {1e3 * ROUGHEST_M:.0f} mm",
     "paint is not sought where it is larger; where that is more than half of the ground, it is named",
+    ("findings",),
+)
+
+CONSTANT_INTENSITY: Final = Witness(
+    "constant_intensity",
+    "lidar",
+    "A lidar's log holds one number in place of the intensity of its returns.",
+    "the intensities of the returns on the ground, in samples of the map",
+    "the returns are used; paint and signs are not found by their intensity, and the sensor is named",
     ("findings",),
 )
 
@@ -193,22 +202,10 @@ class Assets(Stage):
         manifest.settle()
 
     def findings(self, survey: Survey, records: Sequence[LogRecord], manifest: Manifest) -> Sequence[Finding]:
-        """Returns a finding where most of the ground is too rough for the detection of paint."""
+        """Returns findings where most of the ground is too rough to show paint, or intensities do not tell it."""
         if not survey.has("assets"):
             return ()
-        from roadscan.assets.tasks.evidence import EVIDENCE
-
-        records_of = manifest.of(EVIDENCE)
-        found = [one.figures() for unit, one in records_of.items() if unit.startswith(f"{LaneLine.name}/")]
-        dense, rough = (sum(one.get(name, 0) for one in found) for name in ("dense_cells", "rough_cells"))
-        if rough <= _MOST_ROUGH * dense:
-            return ()
-        said = (
-            f"Paint was not sought on {rough / dense:.0%} of the ground that is seen densely enough: its returns "
-            f"scatter by more than {1e3 * ROUGHEST_M:.0f} mm about their mean height, so lane lines and markings are "
-            "missing there. The sensor's noise, poses of passes that disagree, or rough ground do that."
-        )
-        return (ROUGH_READINGS.finds("assets", said),)
+        return (*_rough_readings(manifest), *_constant_intensities(manifest))
 
     def check(self, survey: Survey) -> list[RoadscanError]:
         """Check that kinds, their settings and sensors exist."""
@@ -281,3 +278,31 @@ class Assets(Stage):
             "tables/asset_pictures", ASSET_FOLDER, PICTURE_FOLDER,
             "products/classified_points", "products/ground_sections", "products/bare_earth",
         )  # fmt: skip
+
+
+def _rough_readings(manifest: Manifest) -> Iterator[Finding]:
+    from roadscan.assets.tasks.evidence import EVIDENCE
+
+    records_of = manifest.of(EVIDENCE)
+    found = [one.figures() for unit, one in records_of.items() if unit.startswith(f"{LaneLine.name}/")]
+    dense, rough = (sum(one.get(name, 0) for one in found) for name in ("dense_cells", "rough_cells"))
+    if rough > _MOST_ROUGH * dense:
+        yield ROUGH_READINGS.finds(
+            "assets",
+            f"Paint was not sought on {rough / dense:.0%} of the ground that is seen densely enough: its returns "
+            f"scatter by more than {1e3 * ROUGHEST_M:.0f} mm about their mean height, so lane lines and markings are "
+            "missing there. The sensor's noise, poses of passes that disagree, or rough ground do that.",
+        )
+
+
+def _constant_intensities(manifest: Manifest) -> Iterator[Finding]:
+    from roadscan.assets.tasks.gains import CONSTANT, STATISTICS
+
+    for record in manifest.of(STATISTICS).values():
+        for sensor, intensity in record.figures().get(CONSTANT, {}).items():
+            yield CONSTANT_INTENSITY.finds(
+                "assets",
+                f"The intensity of all returns of {sensor} on the ground is {intensity:g}, so that neither paint nor "
+                "the face of a sign stands out: lane lines, markings and signs are missing where no other sensor shows "
+                "them. Check that the driver writes intensities, and the field of options that names them.",
+            )

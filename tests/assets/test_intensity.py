@@ -11,6 +11,7 @@ from roadscan.assets.intensity import (
     GAINS_SCHEMA,
     IntensitySample,
     calibrated_scene,
+    constant_intensities,
     gains_of,
     intensity_sample,
 )
@@ -72,6 +73,16 @@ def test_gains_are_the_same_for_any_order_of_the_samples_and_fit_their_table() -
     schema = table_schema("intensity_gains")
     assert [c.name for c in schema.columns] == GAINS_SCHEMA.names
     assert schema.faults(schema.conform(one.to_batches()[0])) == []
+
+
+def test_a_sensor_with_one_intensity_for_all_returns_is_named() -> None:
+    found, _ = sample(3, 0.0)
+    even = replace(found, sensors=("even",), intensity=np.full(found.place.size, 17.0))
+    assert constant_intensities([found, even, replace(even, key=(1.0, 0.0))]) == {"even": 17.0}
+    other = replace(even, intensity=np.full(found.place.size, 18.0))
+    assert constant_intensities([even, other]) == {}
+    few = replace(even, **{name: getattr(even, name)[:50] for name in ("place", "sensor", "laser", "intensity")})
+    assert constant_intensities([few]) == {}
 
 
 def test_no_samples_no_gains() -> None:

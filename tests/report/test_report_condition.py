@@ -167,3 +167,24 @@ def test_paint_that_is_not_sought_is_said(tmp_path: Path) -> None:
     (said,) = (one["text"] for one in json.loads(done.stdout)["findings"] if one["witness"] == "rough_readings")
     assert re.match(r"Paint was not sought on \d+% of the ground", said)
     assert "more than 30 mm" in said
+
+
+@pytest.mark.slow
+@pytest.mark.witness("constant_intensity")
+def test_a_lidar_without_intensities_is_named(tmp_path: Path) -> None:
+    """A road of one brightness, seen without noise, is like a driver that writes one number for all returns."""
+    road = Scene.load("demo").road.model_dump() | {
+        "brightness": dict.fromkeys(("asphalt", "shoulder", "verge", "kerb", "marking"), 80.0), "texture": None,
+        "markings": [], "patches": [], "stains": [], "tyre_marks": [], "cracks": [], "potholes": [], "symbols": [],
+    }  # fmt: skip
+    scene = Scene.load("demo").changed(
+        length_m=8.0, passes=[{"lane": 2}], profilers={"on": False}, lidar={"range_max_m": 12.0}, road=road,
+        noise={"intensity": 0.0}, roadside={},
+    )  # fmt: skip
+    file = simulate(scene, tmp_path / "survey").survey_file
+    with file.open("a") as stream:
+        stream.write('\n[assets]\nkinds = ["lane_line"]\n[tiles]\ncell_m = 0.2\n[products]\nmake = []\n')
+    done = roadscan("run", file, "--workers", "0", "--json")
+    assert done.exit_code == 0, done.output
+    (said,) = (one["text"] for one in json.loads(done.stdout)["findings"] if one["witness"] == "constant_intensity")
+    assert re.match(r"The intensity of all returns of \S+ on the ground is \d+", said)

@@ -13,7 +13,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from roadscan.assets.edges.steps import raster_of
-from roadscan.assets.intensity import GAINS_SCHEMA, IntensitySample, gains_of, intensity_sample, light_of
+from roadscan.assets.intensity import (
+    GAINS_SCHEMA,
+    IntensitySample,
+    constant_intensities,
+    gains_of,
+    intensity_sample,
+    light_of,
+)
 from roadscan.assets.kinds.landscape_area import roughness_of_road_m
 from roadscan.assets.scene import Measured, Scene, Statistics, together
 from roadscan.assets.settings import GroundSettings
@@ -60,6 +67,8 @@ SAMPLES: Final = "intensity_samples"
 GAINS: Final = "intensity_gains"
 _UNIT: Final = "all"
 STATISTICS: Final = "scene_statistics"
+CONSTANT: Final = "constant_intensities"
+"""Key, in the detail of the tables' records, of the sensors whose intensity is always the same."""
 _EDGE_M: Final = 40.0
 """Edge of the sampled squares (m). They are the same however the survey is cut for its search."""
 _HALOS: Final = Halos(2.0, 6.0, 24.0)
@@ -200,14 +209,15 @@ def write_gains(gains: GainsPlan, manifest: Manifest, plan: AssetPlan, key: str)
         "samples": [n for _, n in told.values()],
     }
     tables = {GAINS: table, STATISTICS: pa.table(columns, table_schema(STATISTICS).arrow()).sort_by("statistic")}
-    return [_written(plan, name, tables[name], key) for name in gains.tables]
+    detail = json.dumps({CONSTANT: constant_intensities(samples)})
+    return [_written(plan, name, tables[name], key, detail) for name in gains.tables]
 
 
-def _written(plan: AssetPlan, name: str, rows: pa.Table, key: str) -> OutputRecord:
+def _written(plan: AssetPlan, name: str, rows: pa.Table, key: str, detail: str) -> OutputRecord:
     schema = table_schema(name)
     content, target = parquet_bytes(rows.cast(schema.arrow()), schema), f"{schema.location}/{name}.parquet"
     plan.survey.store.write_bytes(target, content)
-    return OutputRecord(name, _UNIT, key, target, len(content), bytes_digest(content))
+    return OutputRecord(name, _UNIT, key, target, len(content), bytes_digest(content), detail)
 
 
 def _samples(gains: GainsPlan, manifest: Manifest, plan: AssetPlan) -> list[IntensitySample]:

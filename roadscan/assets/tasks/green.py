@@ -7,12 +7,12 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 
-from roadscan.assets.green.areas import MARGIN_CELLS, Sums, green_rows, mosaic_of
+from roadscan.assets.green.areas import GREEN_CELLS, MARGIN_CELLS, Sums, green_rows, mosaic_of
 from roadscan.assets.green.cells import CELL_M
 from roadscan.assets.green.colours import REACH_M, Elsewhere, Ground, PlacedGround, ground_of, looked_at
 from roadscan.assets.scene import Box
@@ -42,6 +42,19 @@ _AROUND_M: Final = _MARGIN_M + 2.0 * REACH_M + 1.0
 """Ground this far around a square (m) tells the light of the pictures that show it."""
 
 
+class Wanted(NamedTuple):
+    """What the kinds of a survey ask of pictures of the ground."""
+
+    green: bool
+    paint: bool
+
+    @classmethod
+    def of(cls, plan: AssetPlan) -> Wanted:
+        """Returns what the kinds of a plan ask for."""
+        kinds = [one.kind for one in plan.kinds] if plan.wants_pictures else []
+        return cls(any(one.sees_green for one in kinds), any(one.sees_paint for one in kinds))
+
+
 @dataclass(frozen=True)
 class GreenTask:
     """Some squares whose ground is looked at in pictures. Sent to workers: it carries no picture."""
@@ -56,6 +69,7 @@ class GreenTask:
     paint: tuple[tuple[TileId, OutputRecord], ...]
     """Pieces of lines and markings in them and around them."""
     pictures: Pictures
+    wanted: Wanted
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -94,7 +108,8 @@ class GreenPlan:
 
 def plan_green(plan: AssetPlan, manifest: Manifest) -> GreenPlan:
     """Returns the squares whose ground is to be looked at; none without pictures or a kind that asks for them."""
-    if not (plan.wants_pictures and any(one.kind.sees_green or one.kind.sees_paint for one in plan.kinds)):
+    wanted = Wanted.of(plan)
+    if not any(wanted):
         return GreenPlan()
     try:
         pictures = plan_pictures(plan.survey, replace(picture_rule(plan.config.pictures), reach_m=REACH_M))
@@ -108,7 +123,7 @@ def plan_green(plan: AssetPlan, manifest: Manifest) -> GreenPlan:
         if len(near):
             read = [[r.digest for _, r in _around(plan.grid, square, some)] for some in (ground, screens)]
             read.append([record.digest for _, record in _paint_around(plan.grid, square, paint)])
-            keys[square] = key_of(code, near.key(), read, plan.grid.edge_m)
+            keys[square] = key_of(code, near.key(), read, plan.grid.edge_m, *wanted)
     return GreenPlan(keys, pictures)
 
 
@@ -124,7 +139,8 @@ def green_tasks(plan: AssetPlan, green: GreenPlan, manifest: Manifest, workers: 
         tasks.append(
             GreenTask(plan.survey.store, plan.grid, tuple((s, green.keys[s]) for s in squares),
                       tuple(read[0].items()), tuple(read[1].items()),
-                      tuple(dict.fromkeys(one for s in squares for one in _paint_around(plan.grid, s, paint))), near)
+                      tuple(dict.fromkeys(one for s in squares for one in _paint_around(plan.grid, s, paint))), near,
+                      Wanted.of(plan))
         )  # fmt: skip
     return tasks
 
@@ -191,6 +207,7 @@ def _found(
 ) -> tuple[pa.Table, pa.Table, dict[str, Any]]:
     """Returns rows of a square's planted cells and of its paint, and how many pictures show them or lie elsewhere."""
     from roadscan.assets.paint.brightness import BrightSums, brightness_in
+    from roadscan.assets.tasks.pictured_paint import PAINTED as PAINTED_PIECES
     from roadscan.assets.tasks.pictured_paint import pictured_paint
 
     held = dict(task.ground)
@@ -212,17 +229,22 @@ def _found(
             elsewhere.append(near.name(number))
         elif look is not None:
             sums.add(look, int(bytes_digest(near.name(number).encode())[-1], 16) & 1)
-            bright.add(look.cells, brightness_in(look.colour, look.shown, look.cells, cells), look.pixel_m)
+            if task.wanted.paint:
+                bright.add(look.cells, brightness_in(look.colour, look.shown, look.cells, cells), look.pixel_m)
             shown_by += 1
     known = [recorded_table(task.store, record) for _, record in _paint_around(task.grid, square, task.paint)]
     window, box = _window(task.grid, square, cells, rows, known)
-    mosaic = mosaic_of(sums, window.cell, window.at, window.shape, cells.drive_m[window.cell])
-    first = round(window.corner_m[1] / CELL_M), round(window.corner_m[0] / CELL_M)
-    inner = _box(task.grid, square, 0.0)
-    green = green_rows(
-        mosaic, first, rows, (inner.easting_min_m, inner.northing_min_m, inner.easting_max_m, inner.northing_max_m)
-    )
-    return green, pictured_paint(bright, window, box), {"pictures": shown_by, "elsewhere": elsewhere}
+    green, painted = GREEN_CELLS.empty_table(), PAINTED_PIECES.empty_table()
+    if task.wanted.green:
+        mosaic = mosaic_of(sums, window.cell, window.at, window.shape, cells.drive_m[window.cell])
+        first = round(window.corner_m[1] / CELL_M), round(window.corner_m[0] / CELL_M)
+        inner = _box(task.grid, square, 0.0)
+        green = green_rows(
+            mosaic, first, rows, (inner.easting_min_m, inner.northing_min_m, inner.easting_max_m, inner.northing_max_m)
+        )
+    if task.wanted.paint:
+        painted = pictured_paint(bright, window, box)
+    return green, painted, {"pictures": shown_by, "elsewhere": elsewhere}
 
 
 def _window(

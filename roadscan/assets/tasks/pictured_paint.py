@@ -36,9 +36,12 @@ _DULL: Final = 2.5
 """Contrasts below so many σ of the mosaic's noise are no paint."""
 _HALF, _NEAR = 0.5, 7
 """So do those below this share of the greatest contrast in a square of so many fine cells."""
-_PLAIN: Final = 0.2  # Fine cells whose contrast is within this of 0 are bare, and tell the noise …
+_PLAIN: Final = 0.2
+"""Fine cells whose contrast is within this of 0 are bare, and their scatter tells the noise."""
+_CUT_OFF: Final = 1.1
+"""The noise over that scatter: a normal one of 1 σ of 0.1 has values beyond, without which it seems a tenth smaller."""
 _NOISE_M: Final = 4.0
-"""… of the squares of this edge (m) around each place, which lie within a window wherever its cut may fall."""
+"""Edge of the square around each place whose cells tell (m): wherever a window is cut, the whole square lies in it."""
 _LEAST_NOISE: Final = 0.04  # Least 1 σ of a fine cell's contrast.
 _CANNY: Final = (2.0, 4.0)
 """Thresholds of edges: steps over two fine cells, in units of the noise."""
@@ -161,7 +164,8 @@ def noise_of(mean: Float64, known: Bool) -> Float64:
     plain = np.where(known & (np.abs(mean) < _PLAIN), mean, np.nan)
     there, first, second = (_around(np.nan_to_num(v)) for v in (np.isfinite(plain) * 1.0, plain, plain**2))
     there = np.maximum(there, 1.0)
-    return np.maximum(np.sqrt(np.maximum(second / there - (first / there) ** 2, 0.0)), _LEAST_NOISE)
+    spread = np.sqrt(np.maximum(second / there - (first / there) ** 2, 0.0))
+    return np.maximum(_CUT_OFF * spread, _LEAST_NOISE)
 
 
 def canny_edges(mean: Float64, noise: Float64) -> Bool:
@@ -247,8 +251,7 @@ def pictured_paint(sums: BrightSums, window: Window, box: Box) -> pa.Table:
     """Returns rows of `PAINTED`: paint that pictures show in a box of the window (m, from its corner)."""
     found, edges = contrast_of_pictures(sums, window)
     edges = cv2.dilate(edges.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    parts = (edged(found, one, edges) for one in components_of(found))
-    bright = [one for one in parts if one is not None]
+    bright = [part for one in components_of(found) if (part := edged(found, one, edges)) is not None]
     if not bright:
         return PAINTED.empty_table()
     mask = np.zeros(edges.shape, np.bool_)

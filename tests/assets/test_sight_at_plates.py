@@ -57,6 +57,17 @@ def test_a_plate_that_goes_on_at_one_side_is_open_at_the_other() -> None:
     assert (told["open_less"][0], told["open_more"][0], told["open_top"][0]) == (0.0, 1.0, 1.0)
 
 
+def test_lines_that_pass_where_a_plate_was_show_that_it_moved() -> None:
+    """A lorry's side that was met once, and the road behind it twice as often: its place is passed by two thirds."""
+    side, gone = lines(6.0).returns, lines(6.0)
+    met = np.column_stack([side.x_m, side.y_m, side.height_m])
+    sensor = np.array([0.0, 0.0, 2.0])
+    beyond = sensor + (met - sensor) * (14.0 / met[:, 1])[:, None]
+    told = sight_at(scene_of(np.concatenate([met, beyond, beyond])), PLATE)
+    assert told["passed"][0] == pytest.approx(2.0 / 3.0, abs=0.01)
+    assert sight_at(gone, PLATE)["passed"][0] == 0.0
+
+
 def test_too_few_lines_tell_nothing() -> None:
     told = sight_at(scene_of(np.array([[0.0, 8.0, 2.5], [0.6, 12.0, 2.5]])), PLATE)
     assert all(np.isnan(values).all() for values in told.values())

@@ -69,6 +69,9 @@ _SPOT_SHARE: Final = 0.25
 """1 σ of where within its spot the middle of a beam lies that a plate just stops, as a share of half the spot."""
 _USUAL_HALF_RAD: Final = math.radians(0.17 / 2.0)
 """Half the angle of a beam whose width is not known (rad): that of common spinning lidars."""
+_PASSED: Final = 0.5
+"""A plate stands where no line passes; at its rim some do. Where more than this share of the lines at its place end far
+behind it, what they met has moved."""
 JUDGE: Final = Judge("sign", "82d20c25ece54bb4")
 
 
@@ -136,14 +139,18 @@ def candidates_of(scene: Scene, options: SignOptions) -> list[Plate]:
 
 
 def _with_sight(scene: Scene, found: list[Plate]) -> list[Plate]:
-    """Returns plates with the features of the sight lines at them."""
+    """Returns plates with the features of the sight lines at them, without those through which most lines pass.
+
+    So the sides of vehicles that drive beside the rig are no plates, from however many places they were seen.
+    """
     if not found:
         return []
     lie = [(p.middle_m, _unit_vectors(p.facing_deg, p.tilt_deg), p.outline) for p in found]
     table = np.array([[*middle, *axes, shape.width_m / 2, shape.height_m / 2] for middle, axes, shape in lie])
     sight = sight_at(scene, table)
+    passed = sight.pop("passed")
     return [replace(p, features={**p.features, **{name: float(values[k]) for name, values in sight.items()}})
-            for k, p in enumerate(found)]  # fmt: skip
+            for k, p in enumerate(found) if not passed[k] > _PASSED]  # fmt: skip
 
 
 def _unit_vectors(facing_deg: float, tilt_deg: float) -> Float64:

@@ -58,6 +58,16 @@ def test_a_bridge_a_gantry_and_a_roof() -> None:
     assert not np.isin(classes_of(deck, beside), (classes.BRIDGE_DECK, classes.OVERHEAD_STRUCTURE)).any()
 
 
+def test_the_arm_of_a_lamp_beside_a_bridge_is_none_of_its_deck() -> None:
+    rng = np.random.default_rng(8)
+    deck = np.column_stack([rng.uniform(1, 19, 20_000), rng.uniform(3, 8, 20_000), rng.normal(5.0, 0.01, 20_000)])
+    arm = np.column_stack([rng.normal(10.0, 0.04, 600), rng.uniform(0.8, 2.7, 600), rng.normal(5.6, 0.04, 600)])
+    drive = np.column_stack([np.full(20, 10.0), np.arange(20.0), np.full(20, 2.0), np.ones(20)])
+    found = classes_of(np.concatenate([deck, arm]), drive)
+    assert (found[:20_000] == classes.BRIDGE_DECK).mean() > 0.97
+    assert (found[20_000:][arm[:, 1] < 2.1] != classes.BRIDGE_DECK).mean() > 0.95
+
+
 def test_road_ends_at_a_kerb() -> None:
     rows, columns, cell_m = 80, 120, 0.25
     y = (np.arange(rows) + 0.5) * cell_m

@@ -101,10 +101,17 @@ def drawn(seed: int, folder: Path) -> Path:
     return file
 
 
-def spoil(folder: Path, seed: int, more: Sequence[Float64] = (), blur_px: float = 1.0) -> None:
+def spoil(
+    folder: Path,
+    seed: int,
+    more: Sequence[Float64] = (),
+    blur_px: float = 1.0,
+    tinted: Sequence[tuple[Sequence[Float64], Float64]] = (),
+) -> None:
     """Draw shadows of trees and houses on the ground of all pictures of a survey, and dirt on the lens.
 
-    more : outlines (n, 3) of further shadows; blur_px : 1 σ of the edges of all (pixels).
+    more : outlines (n, 3) of further shadows; blur_px : 1 σ of the edges of all (pixels). tinted : outlines of ground
+    and its brightness over that of the simulator, red to blue (3,).
     """
     known, random = truth.load(folder), np.random.default_rng([seed, 1])
     shadows = [_shadow(random, known.surface, known.scene.length_m) for _ in range(9)] + list(more)
@@ -124,16 +131,19 @@ def spoil(folder: Path, seed: int, more: Sequence[Float64] = (), blur_px: float 
             path = folder / "raw" / run / "camera" / Path(pose["file"]).name
             picture = np.asarray(cv2.imread(str(path)), np.float32)
             turn = Rotation.from_quat([pose[q] for q in ("qx", "qy", "qz", "qw")])
-            shade = np.zeros(dirt.shape, np.float32)
-            for outline in shadows:
-                world = earth.ecef_from_map(outline)
-                own = turn.inv().apply(world - [pose[f"{a}_world_m"] for a in "xyz"])[:, [1, 2, 0]]
-                if (own[:, 2] < 0.7).any():
-                    continue
-                pixel = cv2.projectPoints(own, np.zeros(3), np.zeros(3), matrix, np.zeros(5))[0][:, 0]
-                cv2.fillPoly(shade, [np.clip(np.round(pixel * 8), -80000, 80000).astype(np.int32)], 1.0, shift=3)
-            shade = cv2.GaussianBlur(shade, (0, 0), blur_px)[..., None]
-            light = 1.0 - shade * (1.0 - _SHADE[::-1])
+            light = np.ones((*dirt.shape, 1), np.float32)
+            for outlines, left in [(shadows, _SHADE), *tinted]:
+                drawn_on = np.zeros(dirt.shape, np.float32)
+                for outline in outlines:
+                    world = earth.ecef_from_map(outline)
+                    own = turn.inv().apply(world - [pose[f"{a}_world_m"] for a in "xyz"])[:, [1, 2, 0]]
+                    if (own[:, 2] < 0.7).any():
+                        continue
+                    pixel = cv2.projectPoints(own, np.zeros(3), np.zeros(3), matrix, np.zeros(5))[0][:, 0]
+                    corners = np.clip(np.round(pixel * 8), -80000, 80000).astype(np.int32)
+                    cv2.fillPoly(drawn_on, [corners], 1.0, shift=3)
+                drawn_on = cv2.GaussianBlur(drawn_on, (0, 0), blur_px)[..., None]
+                light = light * (1.0 - drawn_on * (1.0 - left[::-1]))
             # light is linear, digital numbers are its power of 1/2.2
             spoiled = picture * light ** (1 / 2.2) * dirt[..., None] + 70.0 * (1.0 - dirt[..., None])
             done, data = cv2.imencode(".jpg", np.clip(spoiled, 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 88])

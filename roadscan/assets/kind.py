@@ -107,6 +107,8 @@ class AssetKind(ABC):
     """Whether it uses the green ground of pictures (:meth:`with_pictures`)."""
     sees_paint: ClassVar[bool] = False
     """Whether it uses the paint that pictures show, likewise: its pieces are those of lane lines or of markings."""
+    sees_grey_edges: ClassVar[bool] = False
+    """Whether it uses the edges between grey surfaces that pictures show (:meth:`with_grey_edges`)."""
 
     @abstractmethod
     def evidence(self, scene: Scene, options: Any) -> Evidence:
@@ -125,6 +127,10 @@ class AssetKind(ABC):
         """Returns pieces with what green cells (`roadscan.assets.green.areas.GREEN_CELLS`) or paint of pictures
         (`roadscan.assets.tasks.pictured_paint.PAINTED`) say.
         """
+        return pieces
+
+    def with_grey_edges(self, pieces: pa.Table, edges: pa.Table) -> pa.Table:
+        """Returns pieces with what edges between grey surfaces in pictures say, pieces of road edges."""
         return pieces
 
 

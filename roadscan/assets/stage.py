@@ -61,7 +61,7 @@ class Assets(Stage):
     )  # fmt: skip
     writes = (
         "intensity_samples", "intensity_gains", "scene_statistics", "asset_evidence", "asset_screens",
-        "asset_ground", "asset_green", "asset_painted", "asset_visibility", "asset_objects",
+        "asset_ground", "asset_green", "asset_painted", "asset_grey_edges", "asset_visibility", "asset_objects",
         "classified_points", "bare_earth", "ground_sections", AssetKind,
     )  # fmt: skip
 
@@ -274,7 +274,7 @@ class Assets(Stage):
             "tables/intensity_samples", "tables/intensity_gains", "tables/scene_statistics", "tables/asset_evidence",
             "tables/asset_objects",
             "tables/asset_screens", "tables/asset_ground", "tables/asset_green", "tables/asset_painted",
-            "tables/asset_visibility",
+            "tables/asset_grey_edges", "tables/asset_visibility",
             "tables/asset_pictures", ASSET_FOLDER, PICTURE_FOLDER,
             "products/classified_points", "products/ground_sections", "products/bare_earth",
         )  # fmt: skip

@@ -128,7 +128,7 @@ BARRIER_EVIDENCE: Final = 3.0  # Evidence of a cell where something stands.
 LEAST_EVIDENCE: Final = 0.6  # Least evidence of an edge at a station.
 _INSIDE_M: Final = (0.45, 0.95)
 """The height of an edge follows from the road this far inside it (m, from and to)."""
-EDGE_COLUMNS: Final = (*NODE_COLUMNS, "by_kerb", "by_barrier", "right", "evidence")
+EDGE_COLUMNS: Final = (*NODE_COLUMNS, "by_surface", "by_kerb", "by_barrier", "right", "evidence")
 
 
 class Track(NamedTuple):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -10,6 +10,7 @@ import scipy.spatial
 
 from roadscan.assets import classes
 from roadscan.assets.bins import cells_of, in_bins
+from roadscan.assets.edges.along_drive import tracks_of
 from roadscan.assets.scene import Returns, Scene
 from roadscan.compute.array_types import Float64, Int64
 
@@ -25,12 +26,14 @@ _STANDING: Final = 2  # So many returns stand in a cell.
 GROUND_CELLS: Final = pa.schema(
     [
         ("column", pa.int64()), ("row", pa.int64()), ("height_m", pa.float64()), ("intensity", pa.float32()),
-        ("returns", pa.int32()), ("drive_m", pa.float32()), ("stands", pa.bool_()),
+        ("returns", pa.int32()), ("drive_m", pa.float32()), ("aside_m", pa.float32()), ("heading_rad", pa.float32()),
+        ("stands", pa.bool_()),
         ("passes", pa.list_(pa.int32())), ("first_epoch_gps_ns", pa.int64()), ("last_epoch_gps_ns", pa.int64()),
     ]
 )  # fmt: skip
 """A row a cell (easting // 0.25, northing // 0.25): height of bare earth at its middle, mean intensity of its low
-returns, distance of the nearest drive, and whether anything stands there."""
+returns, distance of the nearest drive, how far to the right of the road's first drive and that drive's heading there
+(from east, counter-clockwise; NaN without one), and whether anything stands there."""
 
 
 def ground_cells(scene: Scene) -> pa.Table:
@@ -78,12 +81,25 @@ def ground_cells(scene: Scene) -> pa.Table:
         {
             "column": east + column[known], "row": north + row[known], "height_m": height[known],
             "intensity": intensity.astype(np.float32), "returns": count.astype(np.int32),
-            "drive_m": away[known].astype(np.float32), "stands": np.diff(standing) >= _STANDING,
+            "drive_m": away[known].astype(np.float32), **_beside_drive(scene, np.column_stack([x, y])[known]),
+            "stands": np.diff(standing) >= _STANDING,
             "passes": pa.array(seen_by, pa.list_(pa.int32())),
             "first_epoch_gps_ns": np.array(first, np.int64), "last_epoch_gps_ns": np.array(last, np.int64),
         },
         GROUND_CELLS,
     )  # fmt: skip
+
+
+def _beside_drive(scene: Scene, places_m: Float64) -> dict[str, Any]:
+    """Returns how far to the right (n,) of the first drive of a road places (n, 2) lie (m), and its heading (rad)."""
+    tracks = list(tracks_of(scene.drive_xyh_m))
+    if not tracks:
+        return dict.fromkeys(("aside_m", "heading_rad"), np.full(len(places_m), np.nan, np.float32))
+    stations, heading = (np.concatenate([getattr(one, name) for one in tracks]) for name in ("places", "heading"))
+    _, at = scipy.spatial.cKDTree(stations).query(places_m)
+    step, (east, north) = places_m - stations[at], heading[at].T
+    aside = step[:, 0] * north - step[:, 1] * east
+    return {"aside_m": aside.astype(np.float32), "heading_rad": np.arctan2(north, east).astype(np.float32)}
 
 
 def _nearest(returns: Returns, low: Int64, places_m: Float64) -> Int64:

@@ -13,6 +13,7 @@ import shapely
 from pydantic import Field
 
 from roadscan.assets.edges.along_drive import EDGE_COLUMNS, FARTHEST_M, road_edges
+from roadscan.assets.edges.grey import with_pictured
 from roadscan.assets.edges.line_pieces import Line, joined_lines, line_schema, pieces_table
 from roadscan.assets.edges.steps import raster_of
 from roadscan.assets.green.edges import moved_to_green
@@ -49,6 +50,12 @@ class RoadEdge(AssetKind):
         """Returns pieces whose verges begin where pictures show it."""
         return moved_to_green(pieces, shown)
 
+    sees_grey_edges: ClassVar[bool] = True
+
+    def with_grey_edges(self, pieces: pa.Table, edges: pa.Table) -> pa.Table:
+        """Returns pieces with the edges that pictures show where returns show none."""
+        return with_pictured(pieces, edges)
+
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]
     ) -> Iterable[AssetObject]:
@@ -62,7 +69,8 @@ class RoadEdge(AssetKind):
 
 def _edges(line: Line, right: bool, least_m: float) -> Iterable[AssetObject]:
     kerb, barrier = line.column("by_kerb") > 0.5, line.column("by_barrier") > 0.5
-    types = np.where(kerb, "kerb", np.where(barrier, "barrier", "verge")).tolist()
+    other = np.where(line.column("by_surface") > 0.5, "surface", "verge")
+    types = np.where(kerb, "kerb", np.where(barrier, "barrier", other)).tolist()
     runs = [(str(name), len(list(run))) for name, run in itertools.groupby(types)]
     merged: list[tuple[str, int]] = []
     for name, length in runs:

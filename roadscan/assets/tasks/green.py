@@ -1,4 +1,4 @@
-"""Green ground and paint of squares, from all pictures that show them: the plan, and the work on workers."""
+"""Green ground, paint and grey edges of squares, from all pictures that show them: the plan, and the work."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from roadscan.assets.green.colours import REACH_M, Elsewhere, Ground, PlacedGrou
 from roadscan.assets.scene import Box
 from roadscan.assets.settings import picture_rule
 from roadscan.assets.tasks.evidence import EVIDENCE, GROUND, SCREENS
-from roadscan.assets.tasks.objects import GREEN, PAINTED
+from roadscan.assets.tasks.objects import GREEN, GREY_EDGES, PAINTED
 from roadscan.assets.tasks.pictures import hidden_cells
 from roadscan.assets.tasks.plan import AssetPlan
 from roadscan.assets.tiling import AssetGrid
@@ -47,12 +47,16 @@ class Wanted(NamedTuple):
 
     green: bool
     paint: bool
+    edges: bool
 
     @classmethod
     def of(cls, plan: AssetPlan) -> Wanted:
         """Returns what the kinds of a plan ask for."""
         kinds = [one.kind for one in plan.kinds] if plan.wants_pictures else []
-        return cls(any(one.sees_green for one in kinds), any(one.sees_paint for one in kinds))
+        return cls(
+            any(one.sees_green for one in kinds), any(one.sees_paint for one in kinds),
+            any(one.sees_grey_edges for one in kinds),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -93,7 +97,7 @@ class GreenPlan:
         return [
             square
             for square, key in self.keys.items()
-            if not all(manifest.is_current(name, str(square), key) for name in (GREEN, PAINTED))
+            if not all(manifest.is_current(name, str(square), key) for name in (GREEN, PAINTED, GREY_EDGES))
         ]
 
     def elsewhere(self, manifest: Manifest) -> list[str]:
@@ -103,7 +107,7 @@ class GreenPlan:
 
     def gone(self, manifest: Manifest) -> list[OutputRecord]:
         """Returns outputs of squares that no picture shows any more."""
-        return manifest.beside({GREEN, PAINTED}, {str(square) for square in self.keys})
+        return manifest.beside({GREEN, PAINTED, GREY_EDGES}, {str(square) for square in self.keys})
 
 
 def plan_green(plan: AssetPlan, manifest: Manifest) -> GreenPlan:
@@ -190,9 +194,10 @@ def find_green(task: GreenTask) -> TaskResult:
     screens = {square: recorded_table(task.store, record) for square, record in task.screens}
     for square, key in task.work:
         try:
-            green, painted, counts = _found(task, square, ground, screens, source)
+            green, painted, edges, counts = _found(task, square, ground, screens, source)
             records.append(_record(task, square, key, GREEN, green, {"cells": green.num_rows, **counts}))
             records.append(_record(task, square, key, PAINTED, painted, {"pieces": painted.num_rows}))
+            records.append(_record(task, square, key, GREY_EDGES, edges, {"pieces": edges.num_rows}))
         except Exception as error:  # noqa: BLE001  one square's fault must not stop the others
             failures.append((str(square), reason_of(error)))
     return TaskResult.of(records, failures)
@@ -204,9 +209,11 @@ def _found(
     ground: Mapping[TileId, pa.Table],
     screens: Mapping[TileId, pa.Table],
     source: ColourSource,
-) -> tuple[pa.Table, pa.Table, dict[str, Any]]:
-    """Returns rows of a square's planted cells and of its paint, and how many pictures show them or lie elsewhere."""
+) -> tuple[pa.Table, pa.Table, pa.Table, dict[str, Any]]:
+    """Returns a square's planted cells, paint and grey edges, and how many pictures show them or lie elsewhere."""
     from roadscan.assets.paint.brightness import BrightSums, brightness_in
+    from roadscan.assets.tasks.pictured_edges import GREY_EDGES as EDGES
+    from roadscan.assets.tasks.pictured_edges import grey_edges
     from roadscan.assets.tasks.pictured_paint import PAINTED as PAINTED_PIECES
     from roadscan.assets.tasks.pictured_paint import pictured_paint
 
@@ -229,14 +236,15 @@ def _found(
             elsewhere.append(near.name(number))
         elif look is not None:
             sums.add(look, int(bytes_digest(near.name(number).encode())[-1], 16) & 1)
-            if task.wanted.paint:
+            if task.wanted.paint or task.wanted.edges:
                 bright.add(look.cells, brightness_in(look.colour, look.shown, look.cells, cells), look.pixel_m)
             shown_by += 1
     known = [recorded_table(task.store, record) for _, record in _paint_around(task.grid, square, task.paint)]
     window, box = _window(task.grid, square, cells, rows, known)
-    green, painted = GREEN_CELLS.empty_table(), PAINTED_PIECES.empty_table()
-    if task.wanted.green:
+    green, painted, edges = GREEN_CELLS.empty_table(), PAINTED_PIECES.empty_table(), EDGES.empty_table()
+    if task.wanted.green or task.wanted.edges:
         mosaic = mosaic_of(sums, window.cell, window.at, window.shape, cells.drive_m[window.cell])
+    if task.wanted.green:
         first = round(window.corner_m[1] / CELL_M), round(window.corner_m[0] / CELL_M)
         inner = _box(task.grid, square, 0.0)
         green = green_rows(
@@ -244,7 +252,9 @@ def _found(
         )
     if task.wanted.paint:
         painted = pictured_paint(bright, window, box)
-    return green, painted, {"pictures": shown_by, "elsewhere": elsewhere}
+    if task.wanted.edges:
+        edges = grey_edges(bright, window, box, mosaic.green)
+    return green, painted, edges, {"pictures": shown_by, "elsewhere": elsewhere}
 
 
 def _window(

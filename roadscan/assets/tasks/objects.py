@@ -27,6 +27,8 @@ GREEN: Final = "asset_green"
 """Manifest name of the planted cells of a square that pictures tell."""
 PAINTED: Final = "asset_painted"
 """Manifest name of the paint of a square that pictures show."""
+GREY_EDGES: Final = "asset_grey_edges"
+"""Manifest name of the edges between grey surfaces of a square that pictures show."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,8 @@ class JoinTask:
     key: str
     pictured: tuple[OutputRecord, ...] = ()
     """Green ground or paint of its squares in pictures, for kinds that use it."""
+    edges: tuple[OutputRecord, ...] = ()
+    """Edges between grey surfaces of its squares in pictures, likewise."""
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -102,7 +106,10 @@ def plan_joins(
     }
     looked = {GREEN} if wanted.kind.sees_green else {PAINTED} if wanted.kind.sees_paint else set[str]()
     shown_of = {TileId.parse(u): r for name in looked for u, r in manifest.of(name).items() if r.path}
-    own = clusters[wanted.name] = [Cluster(wanted.name, squares) for squares in clustered({**held, **shown_of})]
+    grey = manifest.of(GREY_EDGES).items() if wanted.kind.sees_grey_edges else ()
+    edges_of = {TileId.parse(u): r for u, r in grey if r.path}
+    squares = clustered({**held, **shown_of, **edges_of})
+    own = clusters[wanted.name] = [Cluster(wanted.name, some) for some in squares]
     objects, code = manifest.of(OBJECTS), wanted.objects_key()
     tasks = []
     for cluster in own:
@@ -118,9 +125,10 @@ def plan_joins(
         pieces = tuple(held[square] for square in cluster.squares if square in held)
         seen = tuple(shown_of[square] for square in cluster.squares if square in shown_of)
         read = [[name, [(r.unit, r.digest) for r in records]] for name, records in others]
-        shown = [[(r.unit, r.digest) for r in seen]] if seen else []
+        edges = tuple(edges_of[square] for square in cluster.squares if square in edges_of)
+        shown = [[(r.unit, r.digest) for r in some] for some in (seen, edges) if some]
         key = key_of(code, grid.edge_m, [(r.unit, r.digest) for r in pieces], read, *shown)
-        tasks.append(JoinTask(store, grid, cluster, wanted.options, pieces, others, key, seen))
+        tasks.append(JoinTask(store, grid, cluster, wanted.options, pieces, others, key, seen, edges))
     units = {cluster.unit for cluster in own}
     gone = tuple(r for u, r in objects.items() if u.startswith(f"{wanted.name}/") and u not in units)
     return JoinPlan(tuple(tasks), gone)
@@ -166,6 +174,8 @@ def _joined(task: JoinTask) -> OutputRecord:
     pieces = pa.concat_tables([kind.piece_schema.empty_table(), *(_read(task.store, r) for r in task.pieces)])
     if task.pictured:
         pieces = kind.with_pictures(pieces, pa.concat_tables([_read(task.store, r) for r in task.pictured]))
+    if task.edges:
+        pieces = kind.with_grey_edges(pieces, pa.concat_tables([_read(task.store, r) for r in task.edges]))
     near = task.cluster.near()
     others = {other: _near(task, records, near) for other, records in task.others}
     curve = curve_named(kind.curve)

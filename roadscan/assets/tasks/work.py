@@ -17,7 +17,7 @@ from roadscan.assets.tasks.evidence import (
     evidence_unit,
 )
 from roadscan.assets.tasks.gains import GAINS, SAMPLES, STATISTICS, GainsPlan, current_gains, plan_gains
-from roadscan.assets.tasks.objects import GREEN, OBJECTS, PAINTED, Cluster, JoinTask, plan_joins
+from roadscan.assets.tasks.objects import GREEN, GREY_EDGES, OBJECTS, PAINTED, Cluster, JoinTask, plan_joins
 from roadscan.assets.tasks.picture_work import CUT_OUTS, SEEN
 from roadscan.assets.tasks.plan import AssetPlan, plan_assets
 from roadscan.assets.tasks.sections import SECTIONS
@@ -31,8 +31,8 @@ from roadscan.tiles.tasks.tile_plan import tiles_of
 from roadscan.tiles.tasks.wanted_products import chosen_tiles
 
 MADE = (
-    SAMPLES, GAINS, STATISTICS, EVIDENCE, CLASSIFIED, BARE_EARTH, SCREENS, GROUND, GREEN, PAINTED, VISIBILITY,
-    OBJECTS, SEEN, CUT_OUTS, TABLES, SECTIONS,
+    SAMPLES, GAINS, STATISTICS, EVIDENCE, CLASSIFIED, BARE_EARTH, SCREENS, GROUND, GREEN, PAINTED, GREY_EDGES,
+    VISIBILITY, OBJECTS, SEEN, CUT_OUTS, TABLES, SECTIONS,
 )  # fmt: skip
 """Names of all outputs in the manifest."""
 
@@ -91,7 +91,7 @@ def _gone(plan: AssetPlan, gains: GainsPlan, manifest: Manifest) -> list[OutputR
         *manifest.beside({EVIDENCE}, evidence),
         *manifest.beside({CLASSIFIED}, units if config.classified else ()),
         *manifest.beside({BARE_EARTH}, units if config.bare_earth else ()),
-        *manifest.beside({SCREENS, GROUND, GREEN, PAINTED}, units if plan.wants_pictures else ()),
+        *manifest.beside({SCREENS, GROUND, GREEN, PAINTED, GREY_EDGES}, units if plan.wants_pictures else ()),
         *manifest.beside({VISIBILITY}, units),
         *manifest.beside({OBJECTS}, objects),
         *manifest.beside({TABLES}, _files(plan)),

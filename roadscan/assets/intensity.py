@@ -23,7 +23,7 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from roadscan.assets.kernels.beams import log_gains, meet_ground
-from roadscan.assets.quantiles import weighted_quantile
+from roadscan.assets.quantiles import median, quantiles, weighted_quantile
 from roadscan.assets.scene import GroundModel, Returns, Scene
 from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.compute.arrays import scatter_about
@@ -217,16 +217,16 @@ def light_of(samples: Sequence[IntensitySample], gains: pa.Table) -> float | Non
 
 
 def constant_intensities(samples: Sequence[IntensitySample]) -> dict[str, float]:
-    """Returns the intensity of each sensor whose returns on the ground all have the same: it is no measurement."""
+    """Returns the intensity of sensors whose returns on the ground all have the same, but for one in a thousand."""
     values: dict[str, list[Float64]] = {}
     for sample in samples:
         for number in np.unique(sample.sensor).tolist():
             values.setdefault(sample.sensors[number], []).append(sample.intensity[sample.sensor == number])
     joined = {sensor: np.concatenate(some) for sensor, some in sorted(values.items())}
     return {
-        sensor: float(one[0])
+        sensor: median(one)
         for sensor, one in joined.items()
-        if one.size >= _FEWEST_OF_CONSTANT and np.ptp(one) <= 1e-6 * abs(one[0])
+        if one.size >= _FEWEST_OF_CONSTANT and np.ptp(quantiles(one, [0.001, 0.999])) <= 1e-4 * abs(median(one))
     }
 
 

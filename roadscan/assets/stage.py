@@ -40,9 +40,9 @@ ROUGH_READINGS: Final = Witness(
 CONSTANT_INTENSITY: Final = Witness(
     "constant_intensity",
     "lidar",
-    "A lidar's log holds one number in place of the intensity of its returns.",
+    "Logs of a lidar hold one number in place of intensities, or intensities are cut off at the end of their range.",
     "the intensities of the returns on the ground, in samples of the map",
-    "the returns are used; paint and signs are not found by their intensity, and the sensor is named",
+    "the returns are used; paint is not found by their intensity, and the sensor is named",
     ("findings",),
 )
 
@@ -302,7 +302,8 @@ def _constant_intensities(manifest: Manifest) -> Iterator[Finding]:
         for sensor, intensity in record.figures().get(CONSTANT, {}).items():
             yield CONSTANT_INTENSITY.finds(
                 "assets",
-                f"The intensity of all returns of {sensor} on the ground is {intensity:g}, so that neither paint nor "
-                "the face of a sign stands out: lane lines, markings and signs are missing where no other sensor shows "
-                "them. Check that the driver writes intensities, and the field of options that names them.",
+                f"The intensity of all returns of {sensor} on the ground, in all runs, is {intensity:g}, so that no "
+                "paint stands out: lane lines and markings are missing where no other sensor shows them, and signs "
+                "where their intensity is the same. Either the driver writes no intensities, or they are cut off at the end "
+                "of their range: check the driver, and the options of the log that name and scale them.",
             )

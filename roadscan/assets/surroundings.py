@@ -68,8 +68,8 @@ _BELOW_CUBES, _ABOVE_CUBES = 1, 4
 """Edges and parapets of a deck reach this far below and above its level cubes (cubes)."""
 _DECK_CELLS: Final = 7
 """Least extent of a deck's lower face in both directions (cells of 0.3 m): that of a gantry is less."""
-_BESIDE_CELLS: Final = 2
-"""Edges and parapets of a deck reach this far beside that face (cells of 0.3 m); arms of lamps reach farther."""
+_ARM_CELLS: Final = 5
+"""What hangs together with a deck and is narrower than this (cells of 0.3 m), as the arm of a lamp, is none of it."""
 
 
 def overhead_classes(
@@ -106,11 +106,11 @@ def overhead_classes(
     faces = cv2.morphologyEx(faces, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     wide = cv2.morphologyEx(faces, cv2.MORPH_OPEN, np.ones((_DECK_CELLS, _DECK_CELLS), np.uint8)) > 0
     decks = np.bincount(label[wide & corridor], minlength=count) > 0
-    own, beside = label[row, column], np.ones((2 * _BESIDE_CELLS + 1, 2 * _BESIDE_CELLS + 1), np.uint8)
+    own, no_arm = label[row, column], np.ones((_ARM_CELLS, _ARM_CELLS), np.uint8)
     out[high & ~leafy & over[own]] = classes.OVERHEAD_STRUCTURE
     for number in np.flatnonzero(over & decks).tolist():
-        about = cv2.dilate((label == number).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        about &= cv2.dilate((wide & (label == number)).astype(np.uint8), beside) > 0
+        deck = cv2.morphologyEx((label == number).astype(np.uint8), cv2.MORPH_OPEN, no_arm)
+        about = cv2.dilate(deck, np.ones((3, 3), np.uint8)) > 0
         layers = layer[level & (own == number)]
         near = high & (layer >= layers.min() - _BELOW_CUBES) & (layer <= layers.max() + _ABOVE_CUBES)
         out[near & about[row, column]] = classes.BRIDGE_DECK

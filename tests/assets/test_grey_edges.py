@@ -155,6 +155,38 @@ def test_of_two_edges_on_one_side_one_stays(edge: dict, types: set[str]) -> None
         assert easting == pytest.approx(EDGE_M, abs=0.05)
 
 
+def edge_along(way: np.ndarray, right: bool, **values: float) -> dict:
+    """An edge along places (n, 2)."""
+    row = {
+        name: [value[0]] * len(way) for name, value in returns_edge(0.0, **values).items() if isinstance(value, list)
+    }
+    return returns_edge(0.0) | row | {
+        "easting_m": way[:, 0].tolist(), "northing_m": way[:, 1].tolist(), "right": [float(right)] * len(way),
+        "passes": [1],
+    }  # fmt: skip
+
+
+AHEAD = np.arange(0.0, 30.1, 0.5)
+
+
+@pytest.mark.parametrize("by", [{}, {"by_kerb": 1.0}])
+@pytest.mark.parametrize(
+    ("returns", "pictured", "right"),
+    [
+        # both left edges of a divided road, whose drives lead in opposite directions
+        (np.column_stack([AHEAD * 0 - 3.0, AHEAD]), np.column_stack([AHEAD * 0 - 9.0, AHEAD[::-1]]), False),
+        # the edges of a road and of a service road beside it
+        (np.column_stack([AHEAD * 0 + 13.0, AHEAD]), np.column_stack([AHEAD * 0 + 4.0, AHEAD]), True),
+        # the edges of two roads that meet at a corner
+        (np.column_stack([AHEAD * 0 + 5.0, AHEAD - 30.0]), np.column_stack([AHEAD + 5.0, AHEAD * 0]), True),
+    ],
+)
+def test_edges_of_other_roads_stay(returns: np.ndarray, pictured: np.ndarray, right: bool, by: dict) -> None:
+    pieces = pa.Table.from_pylist([edge_along(returns, right, **by)], schema=RoadEdge.piece_schema)
+    edges = pa.Table.from_pylist([edge_along(pictured, right, by_surface=1.0, sigma_m=0.05)], schema=GREY_EDGES)
+    assert [len(row["easting_m"]) for row in with_pictured(pieces, edges).to_pylist()] == [AHEAD.size] * 2
+
+
 def test_without_edges_in_pictures_pieces_stay_the_same() -> None:
     pieces = pa.Table.from_pylist([returns_edge(12.0)], schema=RoadEdge.piece_schema)
     assert with_pictured(pieces, GREY_EDGES.empty_table()) is pieces

@@ -79,6 +79,9 @@ def test_a_sensor_with_one_intensity_for_all_returns_is_named() -> None:
     found, _ = sample(3, 0.0)
     even = replace(found, sensors=("even",), intensity=np.full(found.place.size, 17.0))
     assert constant_intensities([found, even, replace(even, key=(1.0, 0.0))]) == {"even": 17.0}
+    one_other = even.intensity.copy()
+    one_other[5] = 0.0
+    assert constant_intensities([replace(even, intensity=one_other)]) == {"even": 17.0}
     other = replace(even, intensity=np.full(found.place.size, 18.0))
     assert constant_intensities([even, other]) == {}
     few = replace(even, **{name: getattr(even, name)[:50] for name in ("place", "sensor", "laser", "intensity")})

@@ -68,6 +68,15 @@ def test_lines_that_pass_where_a_plate_was_show_that_it_moved() -> None:
     assert sight_at(gone, PLATE)["passed"][0] == 0.0
 
 
+def test_lines_beside_a_triangle_do_not_pass_it() -> None:
+    """Lines in the corners of the rectangle about a triangle end behind it."""
+    u, v = (w.ravel() for w in np.meshgrid(np.arange(-0.39, 0.4, 0.02), np.arange(-0.29, 0.3, 0.02)))
+    inside = np.abs(u) / 0.4 <= (0.3 - v) / 0.6
+    sensor, way = np.array([0.0, 0.0, 2.0]), np.column_stack([u, np.full(u.size, 8.0), 0.5 + v])
+    told = sight_at(scene_of(sensor + way * np.where(inside, 1.0, 2.0)[:, None]), PLATE)
+    assert told["passed"][0] == 0.0
+
+
 def test_too_few_lines_tell_nothing() -> None:
     told = sight_at(scene_of(np.array([[0.0, 8.0, 2.5], [0.6, 12.0, 2.5]])), PLATE)
     assert all(np.isnan(values).all() for values in told.values())

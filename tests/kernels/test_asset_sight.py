@@ -146,7 +146,7 @@ def test_rays_at_plates_are_those_that_numpy_counts() -> None:
     starts[3], ends[4] = np.nan, starts[4]
     reach_m, limits = 6.0, (0.08, 1.0, 0.1, 0.5, 0.2)
     thick, far, least, most, cosine = limits
-    counts = np.zeros((2, 5, 3), np.int64)
+    counts = np.zeros((2, 6, 3), np.int64)
     plates = np.column_stack([middle, normal, right, half])
     rays_at_plates(Rays(*np.ascontiguousarray(np.hstack([starts, ends]).T)), plates, reach_m, limits, counts)
 
@@ -165,7 +165,7 @@ def test_rays_at_plates_are_those_that_numpy_counts() -> None:
         strip_u, strip_v = (beside > least) & (beside <= most), (beyond > least) & (beyond <= most)
         level, upright = np.abs(v) <= tall, np.abs(u) <= wide
         parts = (level & upright, level & strip_u & (u < 0), level & strip_u & (u > 0), upright & strip_v & (v > 0),
-                 upright & strip_v & (v < 0))  # fmt: skip
+                 upright & strip_v & (v < 0), (3.0 * np.abs(v) <= tall) & (3.0 * np.abs(u) <= wide))  # fmt: skip
         for part, own in enumerate(parts):
             for sort, some in enumerate((past <= thick, (past > thick) & (past <= far), past > far)):
                 expected[k, part, sort] = np.count_nonzero(told & own & some)

@@ -187,4 +187,4 @@ def test_a_lidar_without_intensities_is_named(tmp_path: Path) -> None:
     done = roadscan("run", file, "--workers", "0", "--json")
     assert done.exit_code == 0, done.output
     (said,) = (one["text"] for one in json.loads(done.stdout)["findings"] if one["witness"] == "constant_intensity")
-    assert re.match(r"The intensity of all returns of \S+ on the ground is \d+", said)
+    assert re.match(r"The intensity of all returns of \S+ on the ground, in all runs, is \d+", said)

@@ -22,6 +22,7 @@ _LOW_M: Final = (-0.3, 0.3)
 """Heights above the ground of returns that tell the intensity of a cell (m)."""
 _STANDS_M: Final = (0.3, 2.5)
 """What returns from these heights above the ground (m) hides the ground of its cell from a camera."""
+_PAST_END_M: Final = 1.0  # Places farther past the end of a drive than this (m) lie beside none.
 _STANDING: Final = 2  # So many returns stand in a cell.
 GROUND_CELLS: Final = pa.schema(
     [
@@ -99,6 +100,7 @@ def _beside_drive(scene: Scene, places_m: Float64) -> dict[str, Any]:
     _, at = scipy.spatial.cKDTree(stations).query(places_m)
     step, (east, north) = places_m - stations[at], heading[at].T
     aside = step[:, 0] * north - step[:, 1] * east
+    aside[np.abs(step[:, 0] * east + step[:, 1] * north) > _PAST_END_M] = np.nan
     return {"aside_m": aside.astype(np.float32), "heading_rad": np.arctan2(north, east).astype(np.float32)}
 
 

@@ -251,8 +251,9 @@ def rays_at_plates(rays, plates, reach_m, limits, counts):
     reach_m : rays that end farther from the middle, seen from above, do not count.
     limits : how far off the plane a ray ends in it, and from where on it ends far behind it; inner and outer edge of
         the strips around the plate, from its outline (m); least cosine between a ray and the normal.
-    counts : (p, 5, 3) int64, added to: rays at the plate, at the strips on its left, on its right, above, below; those
-        that end in the plane, close behind it, far behind it.
+    counts : (p, 6, 3) int64, added to: rays at the plate, at the strips on its left, on its right, above, below, and at
+        the plate's middle third across and upwards, which lies in plates of any shape; those that end in the plane,
+        close behind it, far behind it.
     """
     thick, far, least, most, cosine = limits
     for i in range(rays.from_x.size):
@@ -280,8 +281,12 @@ def rays_at_plates(rays, plates, reach_m, limits, counts):
                 + z * (normal_x * right_y - normal_y * right_x)
             )
             part = _part_of_plate(right, up, plates[k, 9], plates[k, 10], least, most)
-            if part >= 0:
-                counts[k, part, 0 if behind <= thick else (1 if behind <= far else 2)] += 1
+            if part < 0:
+                continue
+            depth = 0 if behind <= thick else (1 if behind <= far else 2)
+            counts[k, part, depth] += 1
+            if 3.0 * abs(right) <= plates[k, 9] and 3.0 * abs(up) <= plates[k, 10]:
+                counts[k, 5, depth] += 1
 
 
 @inlined

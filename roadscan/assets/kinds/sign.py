@@ -69,9 +69,9 @@ _SPOT_SHARE: Final = 0.25
 """1 σ of where within its spot the middle of a beam lies that a plate just stops, as a share of half the spot."""
 _USUAL_HALF_RAD: Final = math.radians(0.17 / 2.0)
 """Half the angle of a beam whose width is not known (rad): that of common spinning lidars."""
-_PASSED: Final = 0.5
-"""A plate stands where no line passes; at its rim some do. Where more than this share of the lines at its place end far
-behind it, what they met has moved."""
+_PASSED: Final = 0.67
+"""A plate stands where no line passes. Where more than this share of the lines at its middle end far behind it, what
+they met has moved; one that was put up between two passes is met by about half of them."""
 JUDGE: Final = Judge("sign", "82d20c25ece54bb4")
 
 

@@ -13,12 +13,12 @@ import numpy as np
 import pyarrow as pa
 
 from roadscan.assets.green.areas import GREEN_CELLS, MARGIN_CELLS, Sums, green_rows, mosaic_of
-from roadscan.assets.green.cells import CELL_M
+from roadscan.assets.green.cells import CELL_M, GROUND_CELLS
 from roadscan.assets.green.colours import REACH_M, Elsewhere, Ground, PlacedGround, ground_of, looked_at
 from roadscan.assets.scene import Box
 from roadscan.assets.settings import picture_rule
 from roadscan.assets.tasks.evidence import EVIDENCE, GROUND, SCREENS
-from roadscan.assets.tasks.objects import GREEN, GREY_EDGES, PAINTED
+from roadscan.assets.tasks.objects import GREEN, GREY_EDGES, PAINTED, read_as
 from roadscan.assets.tasks.pictures import hidden_cells
 from roadscan.assets.tasks.plan import AssetPlan
 from roadscan.assets.tiling import AssetGrid
@@ -190,7 +190,7 @@ def find_green(task: GreenTask) -> TaskResult:
     records: list[OutputRecord] = []
     failures: list[tuple[str, str]] = []
     source = ColourSource(task.pictures)
-    ground = {square: recorded_table(task.store, record) for square, record in task.ground}
+    ground = {square: read_as(task.store, record, GROUND_CELLS) for square, record in task.ground}
     screens = {square: recorded_table(task.store, record) for square, record in task.screens}
     for square, key in task.work:
         try:

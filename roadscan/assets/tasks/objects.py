@@ -15,6 +15,7 @@ from roadscan.assets.tasks.plan import WantedKind
 from roadscan.assets.tiling import AssetGrid
 from roadscan.core.grid import TileId
 from roadscan.core.strict import Strict
+from roadscan.core.errors import RunError
 from roadscan.run.engine.compute import damaged_file, reason_of
 from roadscan.run.keys import key_of
 from roadscan.store.asset_schema import asset_schema
@@ -171,11 +172,12 @@ def join_objects(task: JoinTask) -> TaskResult:
 def _joined(task: JoinTask) -> OutputRecord:
     name = task.cluster.kind
     kind, schema = asset_kinds()[name], asset_schema(name).arrow()
-    pieces = pa.concat_tables([kind.piece_schema.empty_table(), *(_read(task.store, r) for r in task.pieces)])
+    wanted = kind.piece_schema
+    pieces = pa.concat_tables([wanted.empty_table(), *(read_as(task.store, r, wanted) for r in task.pieces)])
     if task.pictured:
-        pieces = kind.with_pictures(pieces, pa.concat_tables([_read(task.store, r) for r in task.pictured]))
+        pieces = kind.with_pictures(pieces, pa.concat_tables([recorded_table(task.store, r) for r in task.pictured]))
     if task.edges:
-        pieces = kind.with_grey_edges(pieces, pa.concat_tables([_read(task.store, r) for r in task.edges]))
+        pieces = kind.with_grey_edges(pieces, pa.concat_tables([recorded_table(task.store, r) for r in task.edges]))
     near = task.cluster.near()
     others = {other: _near(task, records, near) for other, records in task.others}
     curve = curve_named(kind.curve)
@@ -194,7 +196,7 @@ def _near(task: JoinTask, records: Sequence[OutputRecord], near: set[TileId]) ->
     """Returns objects of another kind whose place lies in the cluster or in the squares around it."""
     found: list[AssetObject] = []
     for record in records:
-        rows = _read(task.store, record) if record.path else None
+        rows = recorded_table(task.store, record) if record.path else None
         if rows is None:
             continue
         places = zip(rows["easting_m"].to_pylist(), rows["northing_m"].to_pylist(), strict=True)
@@ -203,5 +205,13 @@ def _near(task: JoinTask, records: Sequence[OutputRecord], near: set[TileId]) ->
     return found
 
 
-def _read(store: Store, record: OutputRecord) -> pa.Table:
-    return recorded_table(store, record)
+def read_as(store: Store, record: OutputRecord, schema: pa.Schema) -> pa.Table:
+    """Returns the table of a record; RunError where another version of roadscan wrote it with other columns."""
+    table = recorded_table(store, record)
+    missing = [name for name in schema.names if name not in table.column_names]
+    if missing:
+        raise RunError(
+            f"{record.name} of {record.unit} was written by another version of roadscan, without the column "
+            f"{missing[0]}; run the survey once without a selection of tiles"
+        )
+    return table

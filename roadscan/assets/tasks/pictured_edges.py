@@ -43,8 +43,8 @@ _NEAR_M: Final = (0.18, 0.85)
 """Ground this far from the edge tells the intensity of a side (m, from and to) …"""
 _FAR_M: Final = 1.5
 """… and that up to this far (m) is like it."""
-_STRIP_M: Final = 3.0
-"""A patch or a lane is no wider than this (m): behind it the road goes on."""
+_STRIP_M, _BEHIND_M = 3.75, 0.75
+"""A patch or a lane is no wider than this (m): behind it the road goes on, which strips of the second width show."""
 _CHANGE, _CHANGE_SIGMAS = 0.08, 4.0
 """Least step of the intensity (share), also over its σ."""
 _FEWEST: Final = 4  # Cells that tell an intensity.
@@ -290,9 +290,8 @@ def change_at(offset_m: float, along: Float64, away: Float64, intensity: Float64
             return None
     if (farther - near) * np.sign(step) < _LIKE * abs(step):
         return None
-    halfway = (_FAR_M + _STRIP_M) / 2.0
-    for behind in ((_FAR_M, halfway), (halfway, _STRIP_M)):
-        if abs(middle(behind)[0] - near) < _LIKE * abs(step):
+    for begin in np.arange(_FAR_M, _STRIP_M, _BEHIND_M):
+        if abs(middle((begin, begin + _BEHIND_M))[0] - near) < _LIKE * abs(step):
             return None
     return Change(abs(step) / sigma, _worse(beyond, intensity, weight))
 

@@ -346,21 +346,21 @@ def _beside_lasers(fan: _Fan) -> tuple[Float64, Float64, Float64]:
 def sight_at(scene: Scene, plates: Float64) -> dict[str, Float64]:
     """Returns features (p,) of the sight lines at plates (p, 11), as the kernel has them; NaN where too few tell it.
 
-    `passed` is the share of the lines at the plate itself that end far behind the plane. `open_top` and `open_below`
-    are those of the lines above and below, `open_less` the smaller one of both sides and `open_more` the greater one.
-    `backed` is the share of the lines about the plate, and at it, that end close behind the plane, `level` that of the
-    lines about it that end in the plane.
+    `passed` is the share of the lines at the plate's middle third that end far behind the plane. `open_top` and
+    `open_below` are those of the lines above and below, `open_less` the smaller one of both sides and `open_more` the
+    greater one. `backed` is the share of the lines about the plate, and at it, that end close behind the plane, `level`
+    that of the lines about it that end in the plane.
     """
     returns = scene.returns
     ends = returns.sensor_x_m, returns.sensor_y_m, returns.sensor_height_m, returns.x_m, returns.y_m, returns.height_m
-    counts = np.zeros((len(plates), 5, 3), np.int64)
+    counts = np.zeros((len(plates), 6, 3), np.int64)
     for lines in (ends, scene.beyond_m):
         rays_at_plates(Rays(*map(read_only, lines)), plates, LINES_M, _SIGHT_LIMITS, counts)
-    passed, left, right, top, below = (_share(counts[:, k], 2) for k in range(5))
+    left, right, top, below, passed = (_share(counts[:, k], 2) for k in range(1, 6))
     return {
         "passed": passed, "open_more": np.fmax(left, right), "open_less": np.minimum(left, right),
         "open_top": top, "open_below": below,
-        "backed": _share(counts.sum(axis=1), 1), "level": _share(counts[:, 1:].sum(axis=1), 0),
+        "backed": _share(counts[:, :5].sum(axis=1), 1), "level": _share(counts[:, 1:5].sum(axis=1), 0),
     }  # fmt: skip
 
 

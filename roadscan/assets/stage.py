@@ -304,6 +304,6 @@ def _constant_intensities(manifest: Manifest) -> Iterator[Finding]:
                 "assets",
                 f"The intensity of all returns of {sensor} on the ground, in all runs, is {intensity:g}, so that no "
                 "paint stands out: lane lines and markings are missing where no other sensor shows them, and signs "
-                "where their intensity is the same. Either the driver writes no intensities, or they are cut off at the end "
-                "of their range: check the driver, and the options of the log that name and scale them.",
+                "where their intensity is the same. Either the driver writes no intensities, or they are cut off at "
+                "the end of their range: check the driver, and the options of the log that name and scale them.",
             )

@@ -63,8 +63,8 @@ def test_lines_that_pass_where_a_plate_was_show_that_it_moved() -> None:
     met = np.column_stack([side.x_m, side.y_m, side.height_m])
     sensor = np.array([0.0, 0.0, 2.0])
     beyond = sensor + (met - sensor) * (14.0 / met[:, 1])[:, None]
-    told = sight_at(scene_of(np.concatenate([met, beyond, beyond])), PLATE)
-    assert told["passed"][0] == pytest.approx(2.0 / 3.0, abs=0.01)
+    seen = sight_at(scene_of(np.concatenate([met, beyond, beyond])), PLATE)
+    assert seen["passed"][0] == pytest.approx(2.0 / 3.0, abs=0.01)
     assert sight_at(gone, PLATE)["passed"][0] == 0.0
 
 
@@ -73,8 +73,8 @@ def test_lines_beside_a_triangle_do_not_pass_it() -> None:
     u, v = (w.ravel() for w in np.meshgrid(np.arange(-0.39, 0.4, 0.02), np.arange(-0.29, 0.3, 0.02)))
     inside = np.abs(u) / 0.4 <= (0.3 - v) / 0.6
     sensor, way = np.array([0.0, 0.0, 2.0]), np.column_stack([u, np.full(u.size, 8.0), 0.5 + v])
-    told = sight_at(scene_of(sensor + way * np.where(inside, 1.0, 2.0)[:, None]), PLATE)
-    assert told["passed"][0] == 0.0
+    seen = sight_at(scene_of(sensor + way * np.where(inside, 1.0, 2.0)[:, None]), PLATE)
+    assert seen["passed"][0] == 0.0
 
 
 def test_too_few_lines_tell_nothing() -> None:

@@ -61,7 +61,7 @@ class _Shown:
         """Returns which nodes (n,) of an edge of returns stay, moves them, and marks nodes of pictures that go.
 
         An edge is compared with the nearest one of pictures that runs in the same direction: those of the other
-        carriageway of a divided road, and of roads that cross, are none of its own.
+        carriageway of a divided road, and of roads that cross, do not count.
         """
         x, y, sigma = (np.array(row[name]) for name in ("easting_m", "northing_m", "sigma_m"))
         kerb, barrier = (np.array(row[name]) > 0.5 for name in ("by_kerb", "by_barrier"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -16,8 +17,12 @@ from roadscan.assets.green.colours import FINE, FINE_M, Ground
 from roadscan.assets.kinds.road_edge import RoadEdge, RoadEdgeOptions
 from roadscan.assets.paint.brightness import BrightSums, Seen
 from roadscan.assets.scene import Box
+from roadscan.assets.tasks.objects import read_as
 from roadscan.assets.tasks.pictured_edges import GREY_EDGES, grey_edges
 from roadscan.assets.tasks.pictured_paint import Known, Window
+from roadscan.core.errors import RunError
+from roadscan.store.manifest import publish_table
+from roadscan.store.store import Store
 
 ROWS, COLUMNS = 72, 48
 """Ground of 18 m along a road and 12 m across (cells)."""
@@ -190,3 +195,13 @@ def test_edges_of_other_roads_stay(returns: np.ndarray, pictured: np.ndarray, ri
 def test_without_edges_in_pictures_pieces_stay_the_same() -> None:
     pieces = pa.Table.from_pylist([returns_edge(12.0)], schema=RoadEdge.piece_schema)
     assert with_pictured(pieces, GREY_EDGES.empty_table()) is pieces
+
+
+def test_tables_of_an_earlier_version_are_named(tmp_path: Path) -> None:
+    store = Store(str(tmp_path), "street")
+    whole = whole_edge()
+    kept = publish_table(store, whole, "asset_evidence", "road_edge/3_4", "new")
+    assert read_as(store, kept, GREY_EDGES).equals(whole)
+    older = publish_table(store, whole.drop_columns(["by_surface"]), "asset_evidence", "road_edge/3_5", "old")
+    with pytest.raises(RunError, match=r"asset_evidence of road_edge/3_5 was written by another version.*by_surface"):
+        read_as(store, older, GREY_EDGES)

@@ -13,9 +13,9 @@ from roadscan.assets.probabilities import curve_named
 from roadscan.assets.tasks.evidence import EVIDENCE
 from roadscan.assets.tasks.plan import WantedKind
 from roadscan.assets.tiling import AssetGrid
+from roadscan.core.errors import RunError
 from roadscan.core.grid import TileId
 from roadscan.core.strict import Strict
-from roadscan.core.errors import RunError
 from roadscan.run.engine.compute import damaged_file, reason_of
 from roadscan.run.keys import key_of
 from roadscan.store.asset_schema import asset_schema
@@ -211,7 +211,7 @@ def read_as(store: Store, record: OutputRecord, schema: pa.Schema) -> pa.Table:
     missing = [name for name in schema.names if name not in table.column_names]
     if missing:
         raise RunError(
-            f"{record.name} of {record.unit} was written by another version of roadscan, without the column "
+            f"{record.product} of {record.unit} was written by another version of roadscan, without the column "
             f"{missing[0]}; run the survey once without a selection of tiles"
         )
     return table

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from benchmarks.grey_streets import drawn, score
+from benchmarks.labelled_street import run
 from benchmarks.lawn_streets import with_and_without_pictures
 from benchmarks.settings import bench_folder
 from benchmarks.timing import Figure
@@ -30,6 +31,7 @@ def figures(folder: Path) -> Iterator[Figure]:
         seen = "looked at" if seed in LOOKED_AT else "only scored"
         street = bench_folder(folder) / f"grey {seed} {model}{'' if edge else ' without an edge'}"
         for name, file in with_and_without_pictures(drawn(seed, model, street, edge), folder):
+            run(file)
             found, what = score(street, file, edge), f"{street.name} ({seen}), {name}"
             yield Figure(f"{what}: length of edges found", found.length_m, "m", found.true_m, "m of edges")
             if edge:

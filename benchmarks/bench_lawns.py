@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 
+from benchmarks.labelled_street import run
 from benchmarks.lawn_streets import drawn, score, with_and_without_pictures
 from benchmarks.timing import Figure
 
@@ -22,6 +23,7 @@ def figures(folder: Path) -> Iterator[Figure]:
     for seed, seen in STREETS.items():
         street = folder / f"lawns {seed}"
         for name, file in with_and_without_pictures(drawn(seed, street), folder):
+            run(file)
             found, what = score(street, file), f"street {seed} ({seen}), {name}"
             yield Figure(f"{what}: lawn found", found.found, "")
             yield Figure(f"{what}: of what is found, right", found.right, "")

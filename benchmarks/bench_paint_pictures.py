@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 
+from benchmarks.labelled_street import run
 from benchmarks.lawn_streets import with_and_without_pictures
 from benchmarks.paint_streets import drawn, score
 from benchmarks.settings import bench_folder
@@ -29,6 +30,7 @@ def figures(folder: Path) -> Iterator[Figure]:
         seen = "looked at" if seed in LOOKED_AT else "only scored"
         street = bench_folder(folder) / f"paint {seed} {model}"
         for name, file in with_and_without_pictures(drawn(seed, model, street), folder):
+            run(file)
             found, what = score(street, file), f"street {seed}, {model} ({seen}), {name}"
             yield Figure(f"{what}: painted length of lines found", found.found, "", found.line_m, "m of paint")
             yield Figure(f"{what}: painted length whose pattern is right", found.pattern, "")

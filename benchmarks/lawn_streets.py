@@ -15,7 +15,6 @@ import pyarrow.parquet as pq
 import shapely
 from scipy.spatial.transform import Rotation
 
-from benchmarks import labelled_street
 from roadscan.run.session import Session
 from roadscan.simulate import Scene, simulate, truth
 from roadscan.simulate.path import Earth
@@ -26,20 +25,17 @@ Float64 = npt.NDArray[np.float64]
 _SHADE: Final = np.array([0.24, 0.27, 0.33])
 """Share of the light, red to blue, that is left in the shade: that of the sky."""
 _DIRT_PX: Final = (8, 30)  # Least and greatest radius of dirt on the lens (pixels).
-
-
 _SETTINGS: Final = {"returns alone": "[assets.pictures]\non = false\n", "with pictures": ""}
 
 
-def with_and_without_pictures(survey: Path, folder: Path) -> Iterator[tuple[str, Path]]:
-    """Run copies of a survey, one without its pictures, and name each with its survey file."""
+def with_and_without_pictures(survey: Path, folder: Path, asset_settings: str = "") -> Iterator[tuple[str, Path]]:
+    """Copy a survey twice into a folder, once told to leave out its pictures, and name each copy's survey file."""
     text = survey.read_text()
     for name, settings in _SETTINGS.items():
         copy = folder / f"{survey.parent.name} {name}"
         shutil.copytree(survey.parent, copy)
         file = copy / "SURVEY.toml"
-        file.write_text(f"{text}\n[assets]\n{settings}")
-        labelled_street.run(file)
+        file.write_text(f"{text}\n[assets]\n{asset_settings}{settings}")
         yield name, file
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 
 from benchmarks.asset_streets import processed
 from benchmarks.grey_streets import grey_street, score, shade
+from benchmarks.lawn_streets import with_and_without_pictures
 from roadscan.simulate import simulate
 
 KINDS = "kinds = ['road_edge', 'lane_line']\nclassified = false\nbare_earth = false\nexports = []\n"
@@ -22,14 +22,10 @@ def test_pictures_show_the_edge_of_a_flush_sidewalk_before_a_facade(tmp_path: Pa
     raw, found = tmp_path / "raw", {}
     simulate(scene, raw)
     shade(raw, 2, edge=True)
-    survey = (raw / "SURVEY.toml").read_text()
-    for name, pictures in (("alone", "[assets.pictures]\non = false\n"), ("with pictures", "")):
-        folder = tmp_path / name
-        shutil.copytree(raw, folder)
-        (folder / "SURVEY.toml").write_text(f"{survey}\n[assets]\n{KINDS}{pictures}")
-        processed(scene, folder)
-        found[name] = score(folder, folder / "SURVEY.toml")
-    alone, both = found["alone"], found["with pictures"]
+    for name, file in with_and_without_pictures(raw / "SURVEY.toml", tmp_path, KINDS):
+        processed(scene, file.parent)
+        found[name] = score(file.parent, file)
+    alone, both = found["returns alone"], found["with pictures"]
     assert alone.near[1] < 0.1
     assert both.near[1] > alone.near[1] + 0.3
     assert both.right > alone.right + 0.3

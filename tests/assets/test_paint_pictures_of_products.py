@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks.asset_streets import processed
+from benchmarks.lawn_streets import with_and_without_pictures
 from benchmarks.paint_streets import paint_street, score
 from roadscan.simulate import simulate
 
@@ -21,14 +21,10 @@ def test_pictures_add_lines_to_products_where_intensity_is_noise(tmp_path: Path)
     scene = paint_street(5, "HDL-32E", intensity_noise=40.0).changed(length_m=34.0)
     raw, found = tmp_path / "raw", {}
     simulate(scene, raw)
-    survey = (raw / "SURVEY.toml").read_text()
-    for name, pictures in (("alone", "[assets.pictures]\non = false\n"), ("with pictures", "")):
-        folder = tmp_path / name
-        shutil.copytree(raw, folder)
-        (folder / "SURVEY.toml").write_text(f"{survey}\n[assets]\n{KINDS}{pictures}")
-        street = processed(scene, folder)
-        found[name] = score(folder, folder / "SURVEY.toml"), street.tables["lane_line"]
-    (alone, own), (both, lines) = found["alone"], found["with pictures"]
+    for name, file in with_and_without_pictures(raw / "SURVEY.toml", tmp_path, KINDS):
+        street = processed(scene, file.parent)
+        found[name] = score(file.parent, file), street.tables["lane_line"]
+    (alone, own), (both, lines) = found["returns alone"], found["with pictures"]
     assert both.found >= alone.found + 0.015
     assert both.right >= alone.right - 0.01
     assert both.marking_f1 > alone.marking_f1

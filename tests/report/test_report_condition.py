@@ -151,20 +151,25 @@ def test_no_pothole_and_no_noise_is_shown_as_a_rut() -> None:
     assert chosen_ruts(station, np.full_like(depths, np.nan), sigmas) == {}
 
 
-@pytest.mark.slow
-@pytest.mark.witness("rough_readings")
-def test_paint_that_is_not_sought_is_said(tmp_path: Path) -> None:
-    """A lidar that errs by 200 mm hides the paint; that no lane line is found is no proof that there is none."""
+def finding_of(witness: str, folder: Path, **changes: object) -> str:
+    """The text of the one finding of a witness, of 8 m of the demo road with changes, asked for lane lines alone."""
     scene = Scene.load("demo").changed(
-        length_m=8.0, passes=[{"lane": 2}], profilers={"on": False}, lidar={"range_max_m": 12.0},
-        noise={"lidar_range_m": 0.2},
-    )  # fmt: skip
-    file = simulate(scene, tmp_path / "survey").survey_file
+        length_m=8.0, passes=[{"lane": 2}], profilers={"on": False}, lidar={"range_max_m": 12.0}, **changes
+    )
+    file = simulate(scene, folder / "survey").survey_file
     with file.open("a") as stream:
         stream.write('\n[assets]\nkinds = ["lane_line"]\n[tiles]\ncell_m = 0.2\n[products]\nmake = []\n')
     done = roadscan("run", file, "--workers", "0", "--json")
     assert done.exit_code == 0, done.output
-    (said,) = (one["text"] for one in json.loads(done.stdout)["findings"] if one["witness"] == "rough_readings")
+    (text,) = (one["text"] for one in json.loads(done.stdout)["findings"] if one["witness"] == witness)
+    return str(text)
+
+
+@pytest.mark.slow
+@pytest.mark.witness("rough_readings")
+def test_paint_that_is_not_sought_is_said(tmp_path: Path) -> None:
+    """A lidar that errs by 200 mm hides the paint; that no lane line is found is no proof that there is none."""
+    said = finding_of("rough_readings", tmp_path, noise={"lidar_range_m": 0.2})
     assert re.match(r"Paint was not sought on \d+% of the ground", said)
     assert "more than 30 mm" in said
 
@@ -177,14 +182,5 @@ def test_a_lidar_without_intensities_is_named(tmp_path: Path) -> None:
         "brightness": dict.fromkeys(("asphalt", "shoulder", "verge", "kerb", "marking"), 80.0), "texture": None,
         "markings": [], "patches": [], "stains": [], "tyre_marks": [], "cracks": [], "potholes": [], "symbols": [],
     }  # fmt: skip
-    scene = Scene.load("demo").changed(
-        length_m=8.0, passes=[{"lane": 2}], profilers={"on": False}, lidar={"range_max_m": 12.0}, road=road,
-        noise={"intensity": 0.0}, roadside={},
-    )  # fmt: skip
-    file = simulate(scene, tmp_path / "survey").survey_file
-    with file.open("a") as stream:
-        stream.write('\n[assets]\nkinds = ["lane_line"]\n[tiles]\ncell_m = 0.2\n[products]\nmake = []\n')
-    done = roadscan("run", file, "--workers", "0", "--json")
-    assert done.exit_code == 0, done.output
-    (said,) = (one["text"] for one in json.loads(done.stdout)["findings"] if one["witness"] == "constant_intensity")
+    said = finding_of("constant_intensity", tmp_path, road=road, noise={"intensity": 0.0}, roadside={})
     assert re.match(r"The intensity of all returns of \S+ on the ground, in all runs, is \d+", said)

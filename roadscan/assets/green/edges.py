@@ -11,6 +11,7 @@ import scipy.spatial
 
 from roadscan.assets.green.colours import FINE, FINE_M
 from roadscan.compute.array_types import Bool, Float64, Int64
+from roadscan.compute.arrays import scatter_about
 
 _ACROSS_M: Final = 0.5
 """An edge is moved by no more than this (m): what the slope of a verge leaves open."""
@@ -101,7 +102,7 @@ def _offset(ground: GreenGround, near: Int64, place_m: Float64, normal: Float64)
     if np.count_nonzero(held) < _LEAST:
         return np.nan, np.nan
     middle = float(np.median(across[held]))
-    scatter = 1.4826 * float(np.median(np.abs(across[held] - middle)))
+    scatter = scatter_about(across[held], middle)
     return middle, float(np.hypot(np.mean(ground.edge_sigma_m[near[held]]), scatter))
 
 

@@ -217,7 +217,7 @@ def _found(
     from roadscan.assets.tasks.pictured_paint import PAINTED as PAINTED_PIECES
     from roadscan.assets.tasks.pictured_paint import pictured_paint
 
-    held = dict(task.ground)
+    held, wanted = dict(task.ground), task.wanted
     rows = pa.concat_tables([ground[name] for name, _ in _around(task.grid, square, held)])
     cells, rows = ground_of(rows, _box(task.grid, square, _AROUND_M))
     hides = [screens[name] for name, _ in _around(task.grid, square, dict(task.screens))]
@@ -235,24 +235,25 @@ def _found(
         if isinstance(look, Elsewhere):
             elsewhere.append(near.name(number))
         elif look is not None:
-            sums.add(look, int(bytes_digest(near.name(number).encode())[-1], 16) & 1)
-            if task.wanted.paint or task.wanted.edges:
+            if wanted.green or wanted.edges:
+                sums.add(look, int(bytes_digest(near.name(number).encode())[-1], 16) & 1)
+            if wanted.paint or wanted.edges:
                 bright.add(look.cells, brightness_in(look.colour, look.shown, look.cells, cells), look.pixel_m)
             shown_by += 1
     known = [recorded_table(task.store, record) for _, record in _paint_around(task.grid, square, task.paint)]
     window, box = _window(task.grid, square, cells, rows, known)
     green, painted, edges = GREEN_CELLS.empty_table(), PAINTED_PIECES.empty_table(), EDGES.empty_table()
-    if task.wanted.green or task.wanted.edges:
+    if wanted.green or wanted.edges:
         mosaic = mosaic_of(sums, window.cell, window.at, window.shape, cells.drive_m[window.cell])
-    if task.wanted.green:
+    if wanted.green:
         first = round(window.corner_m[1] / CELL_M), round(window.corner_m[0] / CELL_M)
         inner = _box(task.grid, square, 0.0)
         green = green_rows(
             mosaic, first, rows, (inner.easting_min_m, inner.northing_min_m, inner.easting_max_m, inner.northing_max_m)
         )
-    if task.wanted.paint:
+    if wanted.paint:
         painted = pictured_paint(bright, window, box)
-    if task.wanted.edges:
+    if wanted.edges:
         edges = grey_edges(bright, window, box, mosaic.green)
     return green, painted, edges, {"pictures": shown_by, "elsewhere": elsewhere}
 

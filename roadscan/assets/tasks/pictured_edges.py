@@ -20,6 +20,7 @@ from roadscan.assets.paint.brightness import BrightSums
 from roadscan.assets.scene import Box
 from roadscan.assets.tasks.pictured_paint import Window
 from roadscan.compute.array_types import Bool, Float64, Int64
+from roadscan.compute.arrays import SIGMA_OF_MAD, scatter_about
 
 GREY_EDGES: Final = line_schema(EDGE_COLUMNS)
 """Columns of a piece of an edge, as those that returns show."""
@@ -214,7 +215,7 @@ def steps_across(level: Float64, first_m: float) -> list[Step]:
     kept = np.flatnonzero(usable)
     step = np.full(border.size, np.nan)
     step[kept] = np.nanmedian(each[:, kept], axis=0)
-    scatter = 1.2533 * 1.4826 * np.nanmedian(np.abs(each[:, kept] - step[kept]), axis=0)
+    scatter = 1.2533 * SIGMA_OF_MAD * np.nanmedian(np.abs(each[:, kept] - step[kept]), axis=0)
     sigma = np.full(border.size, np.nan)
     sigma[kept] = np.hypot(scatter / np.sqrt(seen[:, kept].sum(axis=0)), 0.005)
     middle = np.full(size, np.nan)
@@ -279,15 +280,14 @@ def change_at(offset_m: float, along: Float64, away: Float64, intensity: Float64
     blocks = blocks[np.isfinite(blocks)]
     if blocks.size < _BLOCKS or (blocks * np.sign(step) < _LIKE * abs(step)).any():
         return None
-    scatter = [1.2533 * 1.4826 * float(np.median(np.abs(v - np.median(v)))) / np.sqrt(v.size) for v in (n_near, n_out)]
+    scatter = [1.2533 * scatter_about(v, float(np.median(v))) / np.sqrt(v.size) for v in (n_near, n_out)]
     sigma = max(float(np.hypot(*scatter)), float(blocks.std(ddof=1)) / np.sqrt(blocks.size), 1e-3 * near)
     if abs(step) < max(_CHANGE * near, _CHANGE_SIGMAS * sigma):
         return None
     far, farther = middle((-_FAR_M - 0.3, -_NEAR_M[1]))[0], middle((_NEAR_M[1], _FAR_M))[0]
     driven = float(np.median(intensity[np.abs(away) <= 1.0])) if (np.abs(away) <= 1.0).sum() >= _FEWEST else np.nan
-    for road in (far, driven):
-        if abs(road - near) > _ROAD * abs(step):
-            return None
+    if any(abs(road - near) > _ROAD * abs(step) for road in (far, driven)):
+        return None
     if (farther - near) * np.sign(step) < _LIKE * abs(step):
         return None
     for begin in np.arange(_FAR_M, _STRIP_M, _BEHIND_M):
@@ -306,7 +306,7 @@ def _worse(beyond: Float64, intensity: Float64, weight: Float64) -> float:
     for shift in shifts:
         share = np.clip((x - shift) / CELL_M + 0.5, 0.0, 1.0)
         rest.append(y - low - share * (high - low))
-    scatter = max(1.4826 * float(np.median(np.abs(rest[10]))), _MODEL * abs(high - low))
+    scatter = max(scatter_about(rest[10], 0.0), _MODEL * abs(high - low))
     loss = np.array([w @ np.minimum(np.square(r / scatter), 9.0) for r in rest]) / max(float(w.mean()), 1e-9)
     return float(loss[np.abs(shifts) < _SLACK_M + 1e-6].min() - loss.min())
 
@@ -346,10 +346,9 @@ def node_at(
     at_x, at_y = station.at(np.array([-_DASHES_M, 0.0, _DASHES_M]), np.full(3, sign * step.offset_m))
     if not paint.is_empty and shapely.distance(paint, shapely.LineString(np.column_stack([at_x, at_y]))) < _PAINT_M:
         return None
-    at_x, at_y = at_x[1:2], at_y[1:2]
     near_m = pixel_m[cell][:, np.abs(away - step.offset_m) <= 2.0 * FINE_M]
     off_m = max(_OFF_PX * float(np.nanmedian(near_m)), _LEAST_M)
-    return Node(float(at_x[0]), float(at_y[0]), station.heading, float(np.hypot(off_m, 0.5 * apart)),
+    return Node(float(at_x[1]), float(at_y[1]), station.heading, float(np.hypot(off_m, 0.5 * apart)),
                 change.significance)  # fmt: skip
 
 
@@ -359,8 +358,7 @@ def lines_of(nodes: list[Node]) -> Iterator[Float64]:
         return
     table = np.array(nodes)
     way = np.column_stack([np.cos(table[:, 2]), np.sin(table[:, 2])])
-    after, before = {}, {}
-    pairs = []
+    after, before, pairs = {}, {}, []
     for i, near in enumerate(scipy.spatial.cKDTree(table[:, :2]).query_ball_point(table[:, :2], _NEXT_M)):
         for j in near:
             step = table[j, :2] - table[i, :2]
@@ -390,7 +388,7 @@ def _smoothed(line: Float64) -> Float64:
         across = (near[:, :2] - line[k, :2]) @ right
         off = float(np.median(across))
         out[k, :2] += off * right
-        out[k, 3] = np.hypot(line[k, 3], 1.4826 * float(np.median(np.abs(across - off))))
+        out[k, 3] = np.hypot(line[k, 3], scatter_about(across, off))
     return out
 
 

@@ -66,10 +66,10 @@ def share_of_class(street: LabelledStreet, label: int, *codes: int) -> float:
     return float(np.isin(street.classes[street.point_labels == label], codes).mean())
 
 
-def iou_of_class(street: LabelledStreet, label: int, *codes: int) -> float:
-    """Intersection over union of a label and some classes."""
+def iou_of_class(street: LabelledStreet, labels: tuple[int, ...], *codes: int) -> float:
+    """Intersection over union of some labels and some classes."""
     judged = ~np.isin(street.point_labels, NOT_JUDGED)
-    found, true = np.isin(street.classes, codes) & judged, (street.point_labels == label) & judged
+    found, true = np.isin(street.classes, codes) & judged, np.isin(street.point_labels, labels) & judged
     return float((found & true).sum() / max(int((found | true).sum()), 1))
 
 
@@ -200,12 +200,14 @@ def labelled_edges(
     return LabelledEdges(edge, np.array(step))
 
 
-def kerbs(street: LabelledStreet) -> Found:
-    """Labelled edges of road and sidewalk of 5 cm or more that have a kerb, and kerbs of 5 cm or more at such an edge.
+def kerbs(street: LabelledStreet, beyond: tuple[int, ...] = (SIDEWALK,)) -> Found:
+    """Labelled edges of the road of 5 cm or more that have a kerb, and kerbs of 5 cm or more at such an edge.
+
+    beyond : labels of what lies on the other side of these edges.
 
     Judged is the part of the street 40 m behind, 60 m ahead of and 30 m beside the first pose.
     """
-    table, edges = street.objects("kerb"), labelled_edges(street.places_m, street.labels)
+    table, edges = street.objects("kerb"), labelled_edges(street.places_m, street.labels, beyond)
     part = shapely.box(-40.0, -30.0, 60.0, 30.0)
     inside = shapely.contains_xy(part, edges.places)
     wanted = edges.places[inside & (edges.step_m >= _HIGH_M)]

@@ -27,6 +27,7 @@ PERSON: Final = 70  # user-defined
 FENCE: Final = 71  # user-defined
 SIDEWALK: Final = 72  # user-defined
 FURNITURE: Final = 73  # user-defined
+VEGETATION: Final = (LOW_VEGETATION, MEDIUM_VEGETATION, HIGH_VEGETATION)
 
 CLASS_NAMES: Final = {
     NEVER_CLASSIFIED: "never classified",

@@ -14,21 +14,10 @@ from roadscan.assets.moving import Columns, load_levels, moving_cells
 from roadscan.assets.road_users import Groups, _upper_part, straight_lines
 from roadscan.assets.scene import Box, Scene
 from tests.assets.drives import CAR, PERSON, kitti_drive_returns
-from tests.assets.scenes import semantic_kitti_scene
 
 SET_APART = (classes.VEHICLE, classes.PERSON)
 NO_ASSET = (*SET_APART, classes.GROUND, classes.ROAD, classes.LOW_NOISE)
 WHOLE_DRIVE = slice(None)
-
-
-def test_parked_cars_are_set_apart_and_little_else() -> None:
-    scene, labels = semantic_kitti_scene()
-    cars = scene.classes[labels == 10]
-    assert 1.0 - np.isin(cars, NO_ASSET).mean() <= 0.03
-    users = np.isin(scene.classes, SET_APART)
-    lost = {label: users[labels == label].mean() for label in (50, 51, 70, 71, 80, 81)}
-    assert lost.pop(70) <= 0.01
-    assert max(lost.values()) <= 0.002, lost
 
 
 def test_a_cabin_behind_a_bonnet_belongs_to_its_vehicle_and_a_plate_beside_it_does_not() -> None:

@@ -8,17 +8,10 @@ from roadscan.assets import classes
 from roadscan.assets.ground.bare_earth import road_cells
 from roadscan.assets.scene import Box, GroundModel, Returns
 from roadscan.assets.surroundings import cubes_of, surroundings
-from tests.assets.scenes import semantic_kitti_scene
-from tests.assets.test_bare_earth import airborne, iou
+from tests.assets.test_bare_earth import airborne
 
 NO_DRIVE = np.zeros((0, 4))
 VEGETATION = (classes.LOW_VEGETATION, classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION)
-
-
-def test_vegetation_and_buildings_of_a_street() -> None:
-    scene, labels = semantic_kitti_scene()
-    assert iou(scene.classes == classes.BUILDING, labels == 50, labels) >= 0.90
-    assert iou(np.isin(scene.classes, VEGETATION), np.isin(labels, (70, 71)), labels) >= 0.80
 
 
 def classes_of(points: np.ndarray, drive: np.ndarray = NO_DRIVE) -> np.ndarray:

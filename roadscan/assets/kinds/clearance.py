@@ -24,7 +24,6 @@ CELL_M: Final = 0.5  # Edge of a cell (m).
 _SUPPORT_M: Final = 0.25  # Returns within this height above the lowest one support it (m).
 _NOISE_M: Final = 0.1  # Returns within this height above the lowest one give its height (m).
 _NEAR_M: Final = 12.0  # Returns nearer than this (m) always count.
-_VEGETATION: Final = (classes.LOW_VEGETATION, classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION)
 PIECE_SCHEMA: Final = pa.schema(
     [
         ("pass_id", pa.int32()), ("easting_m", pa.float64()), ("northing_m", pa.float64()), ("height_m", pa.float64()),
@@ -117,7 +116,7 @@ def _cell(scene: Scene, part: Int64, options: ClearanceOptions, bright: float) -
     return {
         "easting_m": returns.corner_m[0] + x, "northing_m": returns.corner_m[1] + y, "height_m": height,
         "clearance_m": height - ground, "returns": int(near.size),
-        "vegetation": float(np.isin(scene.classes[near], _VEGETATION).mean()),
+        "vegetation": float(np.isin(scene.classes[near], classes.VEGETATION).mean()),
         "bright": float((returns.intensity[near] >= bright).mean()),
         "thickness_m": float(np.quantile(returns.height_m[near], 0.9) - height),
         "passes": passes_of(scene, near), "first_epoch_gps_ns": int(epochs.min()),

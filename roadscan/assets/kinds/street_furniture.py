@@ -43,7 +43,6 @@ _TRIMMED: Final = 0.02
 _WALL_M: Final = 3.0  # Surfaces farther off than this (m) do not matter.
 _LEVELS_M: Final = (0.35, 0.6, 0.9, 1.3, 1.9, 2.6)
 """Heights above the ground (m) between which the shares of the returns are features: seats, lids, roofs."""
-_VEGETATION: Final = (classes.LOW_VEGETATION, classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +160,7 @@ def _measured(scene: Scene, rows: Int64, form: Float64) -> Compact | None:
         "level_planes": float(np.mean(flat & (form[:, 3] > 0.9))),
         "upright_planes": float(np.mean(flat & (form[:, 3] < 0.3))),
         "light": float(np.median(light)), "light_spread": float(np.std(light)),
-        "green": float(np.isin(scene.classes[rows], _VEGETATION).mean()),
+        "green": float(np.isin(scene.classes[rows], classes.VEGETATION).mean()),
         "vehicle": float(np.mean(scene.classes[rows] == classes.VEHICLE)),
         "drive_m": _to_drive(scene, x, y), "wall_m": _to_wall(scene, x, y),
     }  # fmt: skip

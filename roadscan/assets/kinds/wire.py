@@ -40,7 +40,6 @@ _LIMITS: Final = np.array([CUBE_M, 0.5, 0.35, 0.07, 0.15, 0.6])
 middles of cubes; inner and outer radius of the tube (m) in which other things are counted."""
 _LEAST_BINS: Final = 5
 """Least number of the twelve bins with returns on the line."""
-_VEGETATION: Final = (classes.LOW_VEGETATION, classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION)
 _NO_WIRE: Final = (classes.GROUND, classes.ROAD, classes.LOW_NOISE, classes.PERSON)
 _LEVELS: Final = np.arange(2, 9)
 """Cubes below and above one (0.5 to 2.25 m) in which a wall, a crown or a roof shows itself."""
@@ -96,7 +95,7 @@ def thin_cubes(scene: Scene) -> tuple[pa.Table, list[Int64]]:
     bounds, order = in_bins(own.astype(np.int32), len(places))
     held = [rows[order[bounds[k] : bounds[k + 1]]] for k in cubes.tolist()]
     of_all, starts = np.concatenate([rows[:0], *held]), np.cumsum([0, *map(len, held)])
-    leaves = np.add.reduceat(np.isin(scene.classes[of_all], _VEGETATION), starts[:-1], dtype=np.int64)
+    leaves = np.add.reduceat(np.isin(scene.classes[of_all], classes.VEGETATION), starts[:-1], dtype=np.int64)
     ground = scene.ground.height_at(middle[cubes, 0], middle[cubes, 1])
     table = pa.table(
         {

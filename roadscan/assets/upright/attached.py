@@ -185,7 +185,7 @@ def _rings(scene: Scene, near: About, shaft: Shaft, own: Bool) -> dict[str, floa
         for k, number in enumerate(count.tolist()):
             told[f"{name}_ring_{k}"] = math.log((number + 1.0) / many)
     kind, close = scene.classes[near.rows], near.away_m < _CROWN_M
-    green = np.isin(kind, (classes.LOW_VEGETATION, classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION))
+    green = np.isin(kind, classes.VEGETATION)
     for name, some in (("green", green), ("front", kind == classes.BUILDING), ("own", own)):
         told[f"{name}_close"] = _share(some, close)
         told[f"{name}_far"] = _share(some, ~close)

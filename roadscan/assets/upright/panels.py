@@ -59,7 +59,6 @@ _ABOVE_GROUND_M: Final = 0.12
 _OPEN_DEG: Final = 1.2  # The top of a surface is open within this angle of the highest beam (degrees).
 _NEAR_M: Final = 3.0
 """Returns within this distance of its line (m) may belong to a surface."""
-_VEGETATION: Final = (classes.LOW_VEGETATION, classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +169,7 @@ def _panel(scene: Scene, region: Region, highest_deg: float) -> Panel | None:
     centre = (xy[:-1] + xy[1:]) / 2
     none = np.zeros(count, np.int64)
     sensor = float(np.mean(returns.sensor_x_m[rows])), float(np.mean(returns.sensor_y_m[rows]))
-    leaves = np.bincount(stretch[np.isin(scene.classes[rows], _VEGETATION)], minlength=count)
+    leaves = np.bincount(stretch[np.isin(scene.classes[rows], classes.VEGETATION)], minlength=count)
     return Panel(
         xy, scene.ground.height_at(centre[:, 0], centre[:, 1]), low, high, bulk,
         np.bincount(stretch, minlength=count), none, none, none, none, none, none, open_top, leaves, region.across_m,

@@ -363,7 +363,6 @@ _LONG_M: Final = 2.5
 """Surfaces from this length (m) are large."""
 _CELLS: Final = 5
 """Cells along each side of the outline, of which some are filled."""
-_VEGETATION: Final = (classes.LOW_VEGETATION, classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION)
 
 
 class PlaneOfPlate(NamedTuple):
@@ -404,7 +403,7 @@ def features_of(
     around = about & ~inside & ~below
     number = max(plane.rows.size, 1)
     light = brightness(scene)[plane.rows]
-    green = np.isin(scene.classes[near[around]], _VEGETATION)
+    green = np.isin(scene.classes[near[around]], classes.VEGETATION)
     return {
         "returns": math.log(number), "range_m": float(np.median(scene.returns.ranges_m(plane.rows))),
         "bright_median": float(np.median(light)), "bright_high": float(np.quantile(light, 0.9)),

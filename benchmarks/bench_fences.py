@@ -1,7 +1,8 @@
-"""Fences and walls on hard streets, metre by metre: found, told right, and what is named a fence elsewhere.
+"""Fences and walls in products of hard streets, metre by metre: found, told right, and what is named a fence elsewhere.
 
-A metre counts where 15 returns or more show it, and most returns at its place are its own. The streets of `SCORED` were
-never looked at; limits of upright surfaces were set while those of `SEEN` were.
+Each street is run by ``roadscan run`` with default settings. A metre counts where 15 returns or more show it, and most
+returns at its place are its own. The streets of `SCORED` were never looked at; limits of upright surfaces were set
+while those of `SEEN` were.
 """
 
 from __future__ import annotations
@@ -10,19 +11,26 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
+import geopandas
+import laspy
 import numpy as np
 import numpy.typing as npt
 import shapely
 
 from benchmarks.hard_streets import hard_street
 from benchmarks.judged_scenes import in_window
-from benchmarks.labelled_returns import LabelledReturns, labelled_returns
+from benchmarks.labelled_returns import labelled_returns
+from benchmarks.labelled_street import run
+from benchmarks.settings import bench_folder
 from benchmarks.timing import Figure
 from roadscan.assets import classes
-from roadscan.assets.kind import asset_kinds
-from roadscan.assets.make_scene import make_scene
-from roadscan.assets.scene import Scene
+from roadscan.assets.scene import Returns
+from roadscan.run.session import Session
 from roadscan.simulate import Scene as Street
+from roadscan.simulate import simulate
+from roadscan.simulate.surface import Surface
+from roadscan.store.asset_schema import asset_tables
+from roadscan.store.store import Store
 
 Float64 = npt.NDArray[np.float64]
 
@@ -32,13 +40,15 @@ SCORED: Final = (807, 808, 811, 813, 819, 822)
 _LEAST: Final = 15  # Returns of a metre that is judged.
 _BESIDE_M, _BEFORE_M, _STEP_M = 0.35, 0.6, 0.5
 """A line is found that lies so far beside a place and so far before or beyond it; lines are points so far apart (m)."""
-_LOWEST_M: Final = 0.3  # Returns higher above bare earth (m) show a fence; walls are judged from 0.55 m on.
+_LOWEST_M: Final = 0.3  # Returns higher above the road's foot there (m) show a fence; walls are judged from 0.55 m on.
+_ON_GROUND: Final = (classes.GROUND, classes.ROAD, classes.KERB, classes.MARKING, classes.SIDEWALK, classes.LOW_NOISE)
 
 
 def figures(folder: Path) -> Iterator[Figure]:
     """Shares of the length, of the streets that were looked at and of those that were only scored."""
     for name, seeds in (("looked at", SEEN), ("only scored", SCORED)):
-        total = sum((metres_of(hard_street(seed)) for seed in seeds), np.zeros(7))
+        own = bench_folder(folder)
+        total = sum((metres_of(hard_street(seed), own / f"hard-{seed}") for seed in seeds), np.zeros(7))
         fences, found, walls, told, named, right, lost = total
         yield Figure(f"{name}: {fences:.0f} m of fences, found", found / fences, "")
         yield Figure(f"{name}: {named:.0f} m named fence, right", right / named, "")
@@ -46,24 +56,26 @@ def figures(folder: Path) -> Iterator[Figure]:
         yield Figure(f"{name}: {fences:.0f} m of fences, classed as vehicles for the most part", lost / fences, "")
 
 
-def metres_of(street: Street) -> Float64:
+def metres_of(street: Street, folder: Path) -> Float64:
     """Metres (7,): fences, found as such, walls, found solid; named fence, right; fences whose returns are vehicles."""
     seen = labelled_returns(street)
-    inside, window, station, offset = in_window(seen, street)
-    scene = make_scene(seen.returns.at(inside), window, window, seen.drive_xyh_m)
-    lines = {kind: _places(scene, seen, kind) for kind in ("fence", "wall", "barrier", "facade")}
+    inside, _, station, offset = in_window(seen, street)
+    store, surface = _run_of(street, folder), seen.surface
+    lines = {kind: _places(store, surface, kind) for kind in ("fence", "wall", "barrier", "facade")}
+    points, of_class = _standing(store, surface)
     own = np.isin(seen.kind[inside], [i for i, k in enumerate(seen.kinds) if k in ("fence", "gate", "wall")])
-    side, high = street.roadside, scene.above_ground_m > _LOWEST_M
+    side, above = street.roadside, seen.returns.height_m[inside] - surface.height_m(*_map_of(seen.returns.at(inside)))
     out = np.zeros(7)
     for one in (*side.fences, *(w for w in side.walls if w.height_m >= 0.55)):
         is_porous = getattr(one, "style", "panels") != "panels"
         for metre in np.arange(max(one.start_m, 0.0) + 0.5, min(one.end_m, street.length_m)):
-            band = (np.abs(station - metre) < 0.5) & (np.abs(offset - one.offset_m) < _LOWEST_M) & high
+            band = (np.abs(station - metre) < 0.5) & (np.abs(offset - one.offset_m) < _LOWEST_M) & (above > _LOWEST_M)
             if own[band].sum() < max(_LEAST, 0.5 * band.sum()):
                 continue
             near = {kind: _near(places, metre, one.offset_m) for kind, places in lines.items()}
             if is_porous:
-                vehicles = (scene.classes[band] == classes.VEHICLE).mean() > 0.5
+                beside = (np.abs(points[0] - metre) < 0.5) & (np.abs(points[1] - one.offset_m) < _LOWEST_M)
+                vehicles = beside.any() and (of_class[beside] == classes.VEHICLE).mean() > 0.5
                 out += [1, near["fence"], 0, 0, 0, 0, vehicles]
             else:
                 out += [0, 0, 1, near["wall"] or near["barrier"] or near["facade"], 0, 0, 0]
@@ -75,16 +87,41 @@ def metres_of(street: Street) -> Float64:
     return out
 
 
-def _places(scene: Scene, seen: LabelledReturns, name: str) -> Float64:
+def _map_of(returns: Returns) -> tuple[Float64, Float64]:
+    east, north = returns.corner_m
+    return east + returns.x_m, north + returns.y_m
+
+
+def _run_of(street: Street, folder: Path) -> Store:
+    """The store of a street that is simulated into a folder and run by default, where that was not done before."""
+    file = folder / "SURVEY.toml"
+    if not file.exists():
+        simulate(street, folder)
+        file.write_text(f"{file.read_text()}\n[assets]\n")
+    run(file)
+    return Session.open(file).store
+
+
+def _places(store: Store, surface: Surface, name: str) -> Float64:
     """Stations and offsets (2, n) along the lines of a kind."""
-    kind = asset_kinds()[name]
+    table = next(table for table, kind in asset_tables().items() if kind == name)
     parts = [np.zeros((2, 0))]
-    for one in kind.objects(kind.evidence(scene, None).pieces, None, {}):
-        flat = shapely.force_2d(one.geometry)
-        line = flat if "Line" in flat.geom_type else flat.exterior
-        at = shapely.line_interpolate_point(line, np.arange(_STEP_M / 2, line.length, _STEP_M))
-        parts.append(np.stack(seen.surface.station_offset_m(*shapely.get_coordinates(at).T.copy())))
+    if store.exists(file := f"products/assets/{table}.parquet"):
+        for one in geopandas.read_parquet(store.path(file)).geometry:
+            flat = shapely.force_2d(one)
+            line = flat if "Line" in flat.geom_type else flat.exterior
+            at = shapely.line_interpolate_point(line, np.arange(_STEP_M / 2, line.length, _STEP_M))
+            parts.append(np.stack(surface.station_offset_m(*shapely.get_coordinates(at).T.copy())))
     return np.concatenate(parts, axis=1)
+
+
+def _standing(store: Store, surface: Surface) -> tuple[Float64, npt.NDArray[np.uint8]]:
+    """Stations and offsets (2, n) of classified points that do not lie on the ground, and their classes."""
+    clouds = [laspy.read(path) for path in sorted(Path(store.path("products/classified_points")).glob("*.laz"))]
+    code = np.concatenate([np.asarray(one.classification) for one in clouds])
+    x, y = (np.concatenate([np.asarray(one[axis]) for one in clouds]) for axis in ("x", "y"))
+    stands = ~np.isin(code, _ON_GROUND)
+    return np.stack(surface.station_offset_m(x[stands], y[stands])), code[stands].astype(np.uint8)
 
 
 def _near(places: Float64, station_m: float, offset_m: float) -> bool:

@@ -506,7 +506,7 @@ def _survey(street: _Street, model: str) -> dict[str, Any]:
              "roll_deg": between(-1, 1), "pitch_deg": between(12, 25) if tilted else between(-1.5, 1.5),
              "heading_deg": between(-180, 180) if not tilted else between(-4, 4)}  # fmt: skip
     return {
-        "bag": {"on": model in ("HDL-64E", "VLP-16")}, "passes": passes,
+        "bag": dict.fromkeys(("on", "trajectory"), model in ("HDL-64E", "VLP-16")), "passes": passes,
         "vehicle": {"speed_m_per_s": speed, "standstill_s": 0.0},
         "lidar": {"model": model, "range_max_m": between(28.0, 45.0), "divergence_deg": "data sheet", "errors": "model",
                   "laser_range_m": between(0.0, 0.02), "laser_gain": between(0.0, 0.35), "dark_m": between(25, 70),

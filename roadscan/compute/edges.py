@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from roadscan.compute.array_types import Float64
 from roadscan.compute.arrays import runs_of
-from roadscan.compute.kernels.edge_across import best_path, step_and_bend
+from roadscan.compute.kernels.edge_across import best_path, best_places, step_and_bend
 
 
 class AcrossSettings(NamedTuple):
@@ -78,18 +78,32 @@ def counted(evidence: Float64, settings: AcrossSettings = DEFAULT) -> Float64:
     return np.where(np.isnan(size), 0.0, np.minimum(size, settings.most) - settings.chance)
 
 
-def path_along(found: Float64, spacing_m: tuple[float, float], settings: AcrossSettings = DEFAULT) -> EdgePath:
-    """Return the path of most evidence (stations, offsets) along a road."""
+def path_along(
+    found: Float64, spacing_m: tuple[float, float], settings: AcrossSettings = DEFAULT, within_m: float | None = None
+) -> EdgePath:
+    """Return the path of most evidence (stations, offsets) along a road.
+
+    within_m : each station's place is that of the best path this far (m) along the road on both sides; what lies
+        farther away does not change it. None: there is one best path over all stations.
+    """
     import scipy.ndimage
 
-    cost = settings.farther_cost * spacing_m[1] * np.arange(found.shape[1])
-    reach = max(round(settings.move_m / spacing_m[1]), 1)
-    total, before = np.empty_like(found), np.empty(found.shape, np.int64)
+    evidence = found - settings.farther_cost * spacing_m[1] * np.arange(found.shape[1])
+    reach, cost = moved_cells(spacing_m[1], settings), settings.move_cost * spacing_m[1]
     path = np.zeros(len(found), np.int64)
-    best_path(found - cost, reach, settings.move_cost * spacing_m[1], total, before, path)
+    if within_m is None:
+        best_path(evidence, reach, cost, np.empty_like(found), np.empty(found.shape, np.int64), path)
+    else:
+        room = np.empty((2, found.shape[1])), np.empty(found.shape[1])
+        best_places(evidence, reach, cost, round(within_m / spacing_m[0]), *room, path)
     own = found[np.arange(len(found)), path] if found.size else np.zeros(0)
     width = max(round(settings.mean_over_m / spacing_m[0]), 1)
     return EdgePath(path, scipy.ndimage.uniform_filter1d(own, width, mode="nearest") if own.size else own)
+
+
+def moved_cells(spacing_m: float, settings: AcrossSettings = DEFAULT) -> int:
+    """Return how many cells an edge moves aside from station to station at the most."""
+    return max(round(settings.move_m / spacing_m), 1)
 
 
 def edge_along(
@@ -98,6 +112,7 @@ def edge_along(
     spacing_m: tuple[float, float],
     known_edge: Float64 | None = None,
     settings: AcrossSettings = DEFAULT,
+    within_m: float | None = None,
 ) -> EdgePath:
     """Return the edge of a road on one side.
 
@@ -107,12 +122,13 @@ def edge_along(
     sigma_m : (stations, offsets) their standard deviations (m).
     spacing_m : of stations and of offsets.
     known_edge : (stations, offsets) evidence (σ) of other kinds, such as that of a kerb or a barrier.
+    within_m : as :func:`path_along` has it.
     """
     step, bend = evidence_across(height_m, sigma_m, spacing_m, settings)
     found = counted(np.fmax(np.abs(step), np.abs(bend)), settings)
     if known_edge is not None:
         found = np.maximum(found, known_edge)
-    return path_along(found, spacing_m, settings)
+    return path_along(found, spacing_m, settings, within_m)
 
 
 LINE_M: Final = 0.6

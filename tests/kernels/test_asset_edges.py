@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 
 import numpy as np
 import pytest
@@ -27,7 +28,7 @@ from roadscan.assets.kernels.step_profiles import (
     fit_nodes,
     walk,
 )
-from roadscan.compute.kernels.edge_across import best_path, step_and_bend
+from roadscan.compute.kernels.edge_across import best_path, best_places, step_and_bend
 
 RNG = np.random.default_rng(8)
 
@@ -98,6 +99,21 @@ def test_the_best_path_is_that_of_a_search_of_all() -> None:
     assert value == pytest.approx(brute(evidence, 2, 0.4))
 
 
+def test_a_place_of_a_path_is_that_of_the_best_path_about_it() -> None:
+    evidence = RNG.normal(size=(9, 5))
+    path = np.zeros(9, np.int64)
+    best_places(evidence, 1, 0.4, 2, np.empty((2, 5)), np.empty(5), path)
+    for station in range(9):
+        near = slice(max(station - 2, 0), station + 3)
+        through = []
+        for offset in range(5):
+            only = np.where(np.arange(5) == offset, evidence[station], -100.0)
+            around = evidence[near].copy()
+            around[station - near.start] = only
+            through.append(brute(around, 1, 0.4))
+        assert path[station] == int(np.argmax(through))
+
+
 def test_steps_and_bends_across_are_those_of_straight_lines() -> None:
     """Least squares by NumPy on both sides of a cell."""
     height = RNG.normal(0.0, 0.01, (5, 12)) + 0.02 * np.arange(12) + np.where(np.arange(12) > 6, 0.05, 0.0)
@@ -135,7 +151,7 @@ def test_links_lead_forward_and_the_strongest_chain_is_traced() -> None:
     assert links[n][0] == -1
     ahead, behind = np.zeros(m), np.zeros(m)
     following, preceding = np.full(m, -1), np.full(m, -1)
-    best_ways(links, lengths, gains, 5.0, 50, ahead, following, behind, preceding)
+    best_ways(links, lengths, gains, 5.0, 50, (1.0, 9.0), ahead, following, behind, preceding)
     # Each link of 0.2 m gains 0.8, and what follows fades with e^(−0.2 / 5).
     expected = sum(0.8 * np.exp(-0.2 / 5.0 * k) for k in range(n - 1))
     assert ahead[0] == pytest.approx(expected, rel=0.05)
@@ -195,7 +211,7 @@ def test_the_best_ways_are_those_over_all_places_in_their_order() -> None:
         gains[i, : to.size] = draw.normal(0.0, 1.0, to.size)
     ahead, behind = np.zeros(n), np.zeros(n)
     following, preceding = np.full(n, -1), np.full(n, -1)
-    best_ways(links, lengths, gains, 6.0, n, ahead, following, behind, preceding)
+    best_ways(links, lengths, gains, 6.0, n, (0.0, 9.0), ahead, following, behind, preceding)
     first, last = np.zeros(n), np.zeros(n)  # all links lead on: each place once tells
     for i in range(n - 1, -1, -1):
         for k in np.flatnonzero(links[i] >= 0).tolist():
@@ -206,4 +222,15 @@ def test_the_best_ways_are_those_over_all_places_in_their_order() -> None:
             last[j] = max(last[j], gains[i, k] + last[i] * np.exp(-lengths[i, k] / 6.0))
     np.testing.assert_allclose(ahead, first, atol=5e-3)
     np.testing.assert_allclose(behind, last, atol=5e-3)
-    assert ((following >= 0) == (ahead > 0)).all() and ((preceding >= 0) == (behind > 0)).all()
+    # The next place is that of the best way of 9 m, of which a link takes up whole tenths of a metre.
+    left = np.zeros((n, 91))
+    for i in range(n - 1, -1, -1):
+        for k in np.flatnonzero(links[i] >= 0).tolist():
+            span = math.ceil(10.0 * lengths[i, k])
+            there = gains[i, k] + left[links[i, k], : 91 - span] * np.exp(-lengths[i, k] / 6.0)
+            left[i, span:] = np.maximum(left[i, span:], there)
+            if left[i, 90] == there[-1]:
+                first[i] = links[i, k]
+    goes_on = left[:, 90] > 0.0
+    assert ((following >= 0) == goes_on).all() and goes_on.mean() > 0.8
+    np.testing.assert_array_equal(following[goes_on], first[goes_on])

@@ -9,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 import scipy.ndimage
 import scipy.spatial
+import shapely
 
 from roadscan.assets import classes
 from roadscan.assets.edges.find import free_edges
@@ -17,16 +18,16 @@ from roadscan.assets.edges.line_pieces import (
     CutEdge,
     columns_of,
     cut_at,
-    dense,
+    dense_by_node,
     line_schema,
     pieces_table,
 )
-from roadscan.assets.edges.profiles import smooth_line
+from roadscan.assets.edges.profiles import smooth_line, stops
 from roadscan.assets.edges.steps import HeightRaster, gaussian, raster_of
 from roadscan.assets.kernels import step_profiles
 from roadscan.assets.scene import Scene, once_a_scene, once_a_tile
-from roadscan.compute.array_types import Bool, Float64
-from roadscan.compute.edges import edge_along
+from roadscan.compute.array_types import Bool, Float64, Int64
+from roadscan.compute.edges import edge_along, moved_cells
 
 FIRST_M: Final = 0.3
 """The transect begins this far (m) behind the middle of the edge's face."""
@@ -77,7 +78,7 @@ def beside_of(scene: Scene) -> Beside:
     rough = np.sqrt(np.nan_to_num(smooth(rest, known, 3.0)))
     edge_x, edge_y = np.zeros(known.shape), np.zeros(known.shape)
     for edge in free_edges(scene):
-        x, y = dense(columns_of(edge)[:, :2], raster.cell_m / 2)
+        x, y = dense_by_node(columns_of(edge)[:, :2], raster.cell_m / 2)
         ux, uy = np.gradient(x), np.gradient(y)
         length = np.maximum(np.hypot(ux, uy), 1e-9)
         row, column = raster.cells_of(x, y)
@@ -118,6 +119,11 @@ def _with_transects(nodes: Float64, beside: Beside, raster: HeightRaster) -> Flo
 
 
 STATION_M: Final = 0.5  # Distance of stations along the drive (m).
+_LATTICE_M: Final = 3.0
+"""Stations lie where the drive crosses a lattice of this edge (m), and evenly between: wherever it enters a scene."""
+_WITHIN_M: Final = 7.0
+"""Edges this far along the drive (m) tell where one lies: with the mean of its evidence, 5 m, and the window of a step,
+1 m, they lie within the halo of a square."""
 NEAREST_M: Final = 0.8  # Edges are sought from this distance to the drive (m) …
 FARTHEST_M: Final = 14.0
 """… to this distance (m)."""
@@ -126,6 +132,8 @@ SAME_ROAD_M: Final = 8.0
 KERB_EVIDENCE: Final = 6.0  # Evidence of a cell at a kerb.
 BARRIER_EVIDENCE: Final = 3.0  # Evidence of a cell where something stands.
 LEAST_EVIDENCE: Final = 0.6  # Least evidence of an edge at a station.
+_FEWEST: Final = 5  # Stations of an edge.
+_AT_KERB_M: Final = 0.4  # An edge so near to its kerb (m) lies on it.
 _INSIDE_M: Final = (0.45, 0.95)
 """The height of an edge follows from the road this far inside it (m, from and to)."""
 EDGE_COLUMNS: Final = (*NODE_COLUMNS, "by_surface", "by_kerb", "by_barrier", "right", "evidence")
@@ -156,8 +164,8 @@ def tracks_of(drive_xyh_m: Float64) -> Iterator[Track]:
 
 
 def _stations(part: Float64, earlier: Float64) -> Iterator[Track]:
-    places = np.column_stack(dense(part, STATION_M))
-    smooth = scipy.ndimage.gaussian_filter1d(places, 4.0, axis=0, mode="nearest")
+    places = stops(part, STATION_M, _LATTICE_M)
+    smooth = scipy.ndimage.gaussian_filter1d(places, 4.0, axis=0, mode="nearest", truncate=2.0)
     heading = np.gradient(smooth, axis=0)
     heading /= np.maximum(np.hypot(*heading.T), 1e-9)[:, None]
     free = np.ones(len(places), np.bool_)
@@ -182,19 +190,17 @@ def _edges_of_drives(scene: Scene) -> list[Float64]:
     raster = raster_of(scene)
     if len(scene.drive_xyh_m) < 2 or not (raster.count > 0).any():
         return []
-    kerbs = [columns_of(edge) for edge in free_edges(scene)]
-    beside = beside_of(scene)
+    kerbs = shapely.STRtree([shapely.LineString(columns_of(edge)[:, :2]) for edge in free_edges(scene)])
     found: list[Float64] = []
     for track in tracks_of(scene.drive_xyh_m):
         for right in (False, True):
-            found += _one_side(track, right, raster, beside, kerbs)
+            found += _one_side(track, right, scene, kerbs)
     return found
 
 
-def _one_side(
-    track: Track, right: bool, raster: HeightRaster, beside: Beside, kerbs: list[Float64]
-) -> Iterator[Float64]:
+def _one_side(track: Track, right: bool, scene: Scene, kerbs: shapely.STRtree) -> Iterator[Float64]:
     """Yields runs of nodes of one side's edge."""
+    raster, beside = raster_of(scene), beside_of(scene)
     out = np.column_stack([track.heading[:, 1], -track.heading[:, 0]]) * (1.0 if right else -1.0)
     offset = np.arange(NEAREST_M, FARTHEST_M, raster.cell_m)
     x = track.places[:, :1] + offset * out[:, :1]
@@ -215,20 +221,16 @@ def _one_side(
     known = np.where(up & inside, KERB_EVIDENCE, np.where(stands & ~behind, BARRIER_EVIDENCE, 0.0))
     height = np.where(behind, np.nan, height)
     sigma = np.full(height.shape, 0.008)
-    found = edge_along(height, sigma, (STATION_M, raster.cell_m), known)
+    found = edge_along(height, sigma, (STATION_M, raster.cell_m), known, within_m=_WITHIN_M)
     at = np.arange(len(offset))[None, :] == found.cell[:, None]
     near = scipy.ndimage.binary_dilation(at, np.ones((1, 5)))
     by_kerb = scipy.ndimage.median_filter((near & up).any(axis=1).astype(np.float64), 5)
     by_barrier = scipy.ndimage.median_filter((near & stands).any(axis=1).astype(np.float64), 5)
     lines = np.column_stack([np.take_along_axis(a, found.cell[:, None], axis=1)[:, 0] for a in (x, y)])
     good = (found.evidence >= LEAST_EVIDENCE) & np.take_along_axis(inside, found.cell[:, None], axis=1)[:, 0]
-    number, count = scipy.ndimage.label(good)
-    for k in range(1, count + 1):
-        rows = np.flatnonzero(number == k)
-        if len(rows) < 5:
-            continue
+    for rows in _runs(good, found.cell, moved_cells(raster.cell_m)):
         line = _snapped(smooth_line(lines[rows], np.ones(len(rows))), by_kerb[rows] > 0.5, kerbs)
-        level = _road_level(line, out[rows], beside, raster)
+        level = _road_level(line, out[rows], beside, scene)
         nodes = np.zeros((len(rows), len(EDGE_COLUMNS)))
         nodes[:, 3:5] = np.nan
         nodes[:, :3] = np.column_stack([line, level])
@@ -240,19 +242,31 @@ def _one_side(
         yield nodes
 
 
-def _road_level(line: Float64, out: Float64, beside: Beside, raster: HeightRaster) -> Float64:
+def _runs(good: Bool, cell: Int64, moved: int) -> Iterator[Int64]:
+    """Yields the rows of five stations or more in a run; where another edge is nearer to the best, a run ends."""
+    begins = np.append(True, np.abs(np.diff(cell)) > moved) | ~good
+    number = np.cumsum(begins)
+    for one in np.unique(number[good]).tolist():
+        rows = np.flatnonzero((number == one) & good)
+        if len(rows) >= _FEWEST:
+            yield rows
+
+
+def _road_level(line: Float64, out: Float64, beside: Beside, scene: Scene) -> Float64:
     """Returns heights (n,) of the road at points (n, 2) of its edge, extrapolated from inside."""
+    raster = raster_of(scene)
     near, far = (beside.height_m[raster.cells_of(*(line - away * out).T)] for away in _INSIDE_M)
     level = near + (near - far) * _INSIDE_M[0] / (_INSIDE_M[1] - _INSIDE_M[0])
-    for other in (near, beside.height_m[raster.cells_of(*line.T)], np.nanmedian(beside.height_m)):
+    here = beside.height_m[raster.cells_of(*line.T)]
+    for other in (near, here, scene.ground.height_at(*line.T), np.nanmedian(beside.height_m)):
         level = np.where(np.isfinite(level), level, other)
     return level
 
 
-def _snapped(line: Float64, at_kerb: Bool, kerbs: list[Float64]) -> Float64:
+def _snapped(line: Float64, at_kerb: Bool, kerbs: shapely.STRtree) -> Float64:
     """Returns points (n, 2) of a line, those at a kerb moved onto it."""
-    if not kerbs or not at_kerb.any():
-        return line
-    points = np.concatenate([np.column_stack(dense(k[:, :2], 0.05)) for k in kerbs])
-    distance, at = scipy.spatial.cKDTree(points).query(line)
-    return np.where((at_kerb & (distance < 0.4))[:, None], points[at], line)
+    moved, rows = line.copy(), np.flatnonzero(at_kerb)
+    near, at = kerbs.query_nearest(shapely.points(line[rows]), max_distance=_AT_KERB_M, all_matches=False)
+    ways = shapely.shortest_line(shapely.points(line[rows[near]]), kerbs.geometries[at])
+    moved[rows[near]] = shapely.get_coordinates(ways).reshape(-1, 2, 2)[:, 1]
+    return moved

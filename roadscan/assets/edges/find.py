@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import scipy.ndimage
 import scipy.spatial
 
@@ -57,10 +58,15 @@ class Edge(NamedTuple):
     nodes: Nodes
     seen: Bool
     """(n,) nodes whose step was measured; the others bridge hidden parts."""
-    evidence: float
-    """Evidence (σ · m) of its places."""
+    evidence: Float64
+    """(n,) evidence (σ · m) of the places about each node."""
     probability: Float64 | None = None
     """(n,) of a kerb at each node; None where it was not judged."""
+
+    def at(self, rows: npt.NDArray[np.int64]) -> Edge:
+        """Returns the part with some of its nodes, which follow one another."""
+        probability = None if self.probability is None else self.probability[rows]
+        return Edge(self.nodes.at(rows), self.seen[rows], self.evidence[rows], probability)
 
 
 DEFAULT: Final = EdgeSettings()
@@ -89,12 +95,13 @@ def found_edges(raster: HeightRaster, heights: Heights, settings: EdgeSettings =
     slopes = raster.slopes
     parts: list[Edge] = []
     for chain in paths_of(step_places(raster)):
-        nodes = profiles.nodes_of(profiles.chain_line(chain), heights, raster, slopes)
-        parts += _measured_runs(nodes, chain.evidence, settings)
+        line = profiles.chain_line(chain)
+        nodes = profiles.nodes_of(line, heights, raster, slopes)
+        parts += _measured_runs(nodes, profiles.evidence_at(line, chain), settings)
     return _bridged(parts, heights, raster, slopes, settings)
 
 
-def _measured_runs(nodes: Nodes, evidence: float, settings: EdgeSettings) -> list[Edge]:
+def _measured_runs(nodes: Nodes, evidence: Float64, settings: EdgeSettings) -> list[Edge]:
     """Returns runs of nodes with a measurable step; up to two nodes without are left inside a run."""
     known = np.isfinite(nodes.sigma_step_m)
     low, high, scatter = (_medians_of_five(c, known) for c in (nodes.seen_low, nodes.seen_high_m, nodes.scatter_m))
@@ -108,7 +115,7 @@ def _measured_runs(nodes: Nodes, evidence: float, settings: EdgeSettings) -> lis
     for k in range(1, count + 1):
         rows = np.flatnonzero(number == k)
         if (len(rows) - 1) * NODE_M >= settings.least_part_m:
-            edges.append(Edge(nodes.at(rows), good[rows], evidence * len(rows) / len(good)))
+            edges.append(Edge(nodes.at(rows), good[rows], evidence[rows]))
     return edges
 
 
@@ -142,7 +149,7 @@ def _bridged(
         while at in after:
             at = after[at]
             edge = _joined(edge, parts[at], heights, raster, slopes, settings)
-        enough = edge.evidence >= settings.least_evidence
+        enough = float(edge.evidence.sum()) >= settings.least_evidence
         if enough and float(edge.seen.sum() - 1) * NODE_M >= settings.least_length_m:
             edges.append(edge)
     return edges
@@ -192,7 +199,7 @@ def _joined(
     share = (np.arange(1, pieces) / pieces)[:, None]
     between = ends[0] + share * (ends[1] - ends[0])
     if len(between) == 0:
-        return Edge(_chained(a.nodes, b.nodes), np.concatenate([a.seen, b.seen]), a.evidence + b.evidence)
+        return _end_to_end(a, b)
     line = np.concatenate([ends[:1], between, ends[1:]])
     measured = profiles.nodes_of(line, heights, raster, slopes).at(slice(1, -1))
     seen = np.isfinite(measured.sigma_step_m) & (measured.seen_low >= settings.seen_low)
@@ -206,12 +213,12 @@ def _joined(
         np.zeros(pieces - 1),
     )  # fmt: skip
     mixed = Nodes(*(np.where(seen, m, h) for m, h in zip(measured, hidden, strict=True)))
-    nodes = _chained(_chained(a.nodes, mixed), b.nodes)
-    return Edge(nodes, np.concatenate([a.seen, seen, b.seen]), a.evidence + b.evidence)
+    return _end_to_end(_end_to_end(a, Edge(mixed, seen, np.zeros(len(seen)))), b)
 
 
-def _chained(a: Nodes, b: Nodes) -> Nodes:
-    return Nodes(*(np.concatenate([p, q]) for p, q in zip(a, b, strict=True)))
+def _end_to_end(a: Edge, b: Edge) -> Edge:
+    nodes = Nodes(*(np.concatenate([p, q]) for p, q in zip(a.nodes, b.nodes, strict=True)))
+    return Edge(nodes, np.concatenate([a.seen, b.seen]), np.concatenate([a.evidence, b.evidence]))
 
 
 _AROUND_NODES: Final = 7
@@ -222,6 +229,7 @@ _STANDING_M: Final = (0.3, 2.0)
 """Heights above the ground (m) at which fences, walls and hedges are seen."""
 _PLANTS_M: Final = (0.05, 0.3)  # Heights above the ground (m) of grass and of the lower parts of plants.
 _LONG_M: Final = 12.0  # Longer edges (m) are alike: windows cut them anywhere.
+_EVIDENCE_NODES: Final = 20  # Nodes (10 m) to both sides whose evidence counts.
 _MOST_EVIDENCE: Final = 4.0  # Greatest evidence (σ) a metre that is told.
 _MOST_RATIO: Final = 30.0  # Greatest significance that is told: more says no more.
 _LEAST_SIGMA_M: Final = 0.004  # Error (m) of a step that the lines of its sides do not show.
@@ -244,10 +252,15 @@ def node_features(scene: Scene, edges: Sequence[Edge]) -> dict[str, Float64]:
     ends = np.cumsum([len(n.x_m) for n in nodes])
     rows = [slice(end - len(n.x_m), end) for end, n in zip(ends, nodes, strict=True)]
     out = {name: np.concatenate([_medians_of_known(column[k]) for k in rows]) for name, column in measured.items()}
-    length_m, seen_m = (NODE_M * np.array([f(e.seen) for e in edges], np.float64) for f in (len, np.count_nonzero))
-    evidence = np.array([e.evidence for e in edges]) / np.maximum(seen_m, NODE_M)
-    of_edges = {"length_m": np.minimum(length_m, _LONG_M), "evidence": np.minimum(evidence, _MOST_EVIDENCE)}
-    return out | {name: np.repeat(values, [len(n.x_m) for n in nodes]) for name, values in of_edges.items()}
+    lengths = [np.full(len(edge.seen), min(NODE_M * len(edge.seen), _LONG_M)) for edge in edges]
+    evidence = np.concatenate([_evidence_a_metre(edge) for edge in edges])
+    return out | {"length_m": np.concatenate(lengths), "evidence": np.minimum(evidence, _MOST_EVIDENCE)}
+
+
+def _evidence_a_metre(edge: Edge) -> Float64:
+    """Returns the evidence (n,) (σ) a metre that is seen of an edge within 10 m of each node, as far as it goes."""
+    seen = means_about(edge.seen.astype(np.float64), _EVIDENCE_NODES)
+    return means_about(edge.evidence, _EVIDENCE_NODES) / np.maximum(NODE_M * seen, 1e-9)
 
 
 def _medians_of_known(values: Float64) -> Float64:
@@ -322,7 +335,8 @@ _SHORTEST_M: Final = 1.5  # Shorter parts are left out (m).
 _FENCE_M: Final = (0.35, 1.2)
 """Heights above the ground at which every fence and wall is seen (m)."""
 _LEAST_RETURNS: Final = 2  # An object has at least this many returns in a cell.
-_MOST: Final = 0.5  # Share of an edge from which it counts as taken.
+_MOST: Final = 0.5  # Share of an edge's nodes from which it counts as taken.
+_FOOT_NODES: Final = 12  # Nodes (6 m) to both sides over which that share is taken.
 _VEHICLE_M: Final = 0.9  # Half of a vehicle's width (m).
 _OTHERS: Final = (
     classes.VEHICLE, classes.PERSON, classes.LOW_NOISE, classes.HIGH_NOISE, classes.LOW_VEGETATION,
@@ -344,12 +358,32 @@ def free_edges(scene: Scene) -> list[Edge]:
 
 
 def open_edges(scene: Scene) -> list[Edge]:
-    """Returns the scene's edges without those at whose foot mostly something stands, and those under a drive."""
+    """Returns the scene's edges without the parts at whose foot mostly something stands, and those under a drive."""
     raster, edges = raster_of(scene), edges_of(scene)
     if not edges:
         return []
     taken = _standing(scene) | _driven(scene)
-    return [e for e in edges if np.mean(taken[raster.cells_of(e.nodes.x_m, e.nodes.y_m)]) <= _MOST]
+    return [part for e in edges for part in free_parts(e, taken[raster.cells_of(e.nodes.x_m, e.nodes.y_m)])]
+
+
+def free_parts(edge: Edge, taken: Bool) -> list[Edge]:
+    """Returns the runs of an edge's nodes about which less than half is taken; taken : (n,) of each node.
+
+    What lies farther along the edge does not count: a scene does not hold all of a long one.
+    """
+    free = means_about(taken.astype(np.float64), _FOOT_NODES) <= _MOST
+    if free.all():
+        return [edge]
+    number, count = scipy.ndimage.label(free)
+    runs = (np.flatnonzero(number == k) for k in range(1, count + 1))
+    return [edge.at(rows) for rows in runs if (len(rows) - 1) * NODE_M >= _SHORTEST_M and edge.seen[rows].any()]
+
+
+def means_about(values: Float64, nodes: int) -> Float64:
+    """Returns means (n,) of the values of so many nodes to both sides of each, as far as the edge goes."""
+    total, at = np.append(0.0, np.cumsum(values)), np.arange(len(values))
+    first, end = np.maximum(at - nodes, 0), np.minimum(at + nodes + 1, len(values))
+    return np.asarray((total[end] - total[first]) / (end - first))
 
 
 def _driven(scene: Scene) -> Bool:
@@ -389,6 +423,5 @@ def kerb_parts(edge: Edge, probability: Float64) -> list[Edge]:
     for k in range(1, count + 1):
         rows = np.flatnonzero(number == k)
         if (len(rows) - 1) * NODE_M >= _SHORTEST_M and edge.seen[rows].any():
-            share = len(rows) / len(edge.seen)
-            parts.append(Edge(edge.nodes.at(rows), edge.seen[rows], edge.evidence * share, smooth[rows]))
+            parts.append(edge._replace(probability=smooth).at(rows))
     return parts

@@ -47,6 +47,11 @@ LINE_PIECES: Final = line_schema(NODE_COLUMNS)
 its ends lie on the tile's border. `seen` is 1 for nodes whose step was measured; `probability` is that of a kerb."""
 JOIN_M: Final = 0.5
 """Greatest distance (m) between the ends of two tiles' lines on their border."""
+SAME_M: Final = 1e-3
+"""Ends of two tiles' lines that lie so near (m) to one another, and to the straight way between the nodes beside them,
+are the cut of one line …"""
+SEGMENT_M: Final = 0.75
+"""… whose nodes are no farther apart than this (m), half more than they are as a rule."""
 NEAR_M: Final = 0.25
 """Returns this near to a line (m) show it."""
 
@@ -111,7 +116,10 @@ def columns_of(edge: Edge) -> Float64:
 
 
 def cut_at(nodes: Float64, tile: Box) -> list[CutEdge]:
-    """Returns parts of a line (n, columns) within a tile; ends on its border are interpolated between nodes."""
+    """Returns parts of a line (n, columns) within a tile; ends on its border are interpolated between nodes.
+
+    A part ends on the border also where a node lies on it: the line may go on in the next tile.
+    """
     parts: list[list[Float64]] = []
     cuts: list[list[bool]] = []
     for a, b in itertools.pairwise(nodes):
@@ -121,10 +129,14 @@ def cut_at(nodes: Float64, tile: Box) -> list[CutEdge]:
         t0, t1 = inner
         if t0 > 0.0 or not parts or cuts[-1][1]:
             parts.append([_between(a, b, t0)])
-            cuts.append([t0 > 0.0, False])
+            cuts.append([t0 > 0.0 or _on_border(a, tile), False])
         parts[-1].append(_between(a, b, t1))
-        cuts[-1][1] = t1 < 1.0
+        cuts[-1][1] = t1 < 1.0 or _on_border(b, tile)
     return [CutEdge(np.array(p), *c) for p, c in zip(parts, cuts, strict=True)]
+
+
+def _on_border(node: Float64, tile: Box) -> bool:
+    return node[0] in {tile.x_min_m, tile.x_max_m} or node[1] in {tile.y_min_m, tile.y_max_m}
 
 
 def _inside(a: Float64, b: Float64, tile: Box) -> tuple[float, float] | None:
@@ -217,6 +229,15 @@ def dense(line: Float64, every_m: float) -> tuple[Float64, Float64]:
     return np.interp(at, length, line[:, 0]), np.interp(at, length, line[:, 1])
 
 
+def dense_by_node(line: Float64, every_m: float) -> tuple[Float64, Float64]:
+    """Returns the same with all nodes among the points: so they are the same for a part of the line."""
+    counts = np.maximum(np.ceil(np.hypot(*np.diff(line, axis=0).T) / every_m).astype(np.int64), 1)
+    at = np.concatenate([np.zeros(1), np.cumsum(np.repeat(1.0 / counts, counts))])
+    at[np.append(0, np.cumsum(counts))] = np.arange(len(line))
+    whole = np.arange(len(line))
+    return np.interp(at, whole, line[:, 0]), np.interp(at, whole, line[:, 1])
+
+
 def joined_lines(pieces: pa.Table) -> list[Line]:
     """Returns lines of the pieces of all tiles: ends on a border meet the nearest end from the other side."""
     names = node_names(pieces.schema)
@@ -274,12 +295,28 @@ def _direction(line: Line, end: int) -> Float64:
 
 
 def _end_to_end(a: Line, b: Line) -> Line:
-    """Returns both lines as one; their ends on the border become one node in the middle."""
-    both = np.stack([a.nodes[-1], b.nodes[0]])
-    known = np.isfinite(both)
-    middle = np.where(known, both, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
-    middle = np.where(known.any(axis=0), middle, np.nan)
-    return Line(np.concatenate([a.nodes[:-1], middle[None], b.nodes[1:]]), a.seen_by.with_other(b.seen_by), a.names)
+    """Returns both lines as one, with the nodes of the uncut line: ends that the cut put on one segment go.
+
+    Others become one node in the middle.
+    """
+    ends, seen_by = [], a.seen_by.with_other(b.seen_by)
+    if not _cuts_a_segment(a, b):
+        both = np.stack([a.nodes[-1], b.nodes[0]])
+        known = np.isfinite(both)
+        middle = np.where(known, both, 0.0).sum(axis=0) / np.maximum(known.sum(axis=0), 1)
+        ends = [np.where(known.any(axis=0), middle, np.nan)[None]]
+    return Line(np.concatenate([a.nodes[:-1], *ends, b.nodes[1:]]), seen_by, a.names)
+
+
+def _cuts_a_segment(a: Line, b: Line) -> bool:
+    """Returns whether the end of a line and the beginning of the next lie between neighbouring nodes of one line."""
+    first, last = a.nodes[-2, :2], b.nodes[1, :2]
+    way = last - first
+    length = float(np.hypot(*way))
+    if not 0.0 < length <= SEGMENT_M:
+        return False
+    aside = (np.stack([a.nodes[-1, :2], b.nodes[0, :2]]) - first) @ np.array([way[1], -way[0]]) / length
+    return bool(np.abs(aside).max() <= SAME_M and np.hypot(*(a.nodes[-1, :2] - b.nodes[0, :2])) <= SAME_M)
 
 
 MEDIAN_NODES: Final = 5

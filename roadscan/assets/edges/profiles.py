@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg
 import scipy.ndimage
+import scipy.spatial
 
 from roadscan.assets.bins import cells_of, in_bins
 from roadscan.assets.edges.steps import HeightRaster, Places
@@ -43,6 +44,9 @@ class PathSettings(NamedTuple):
     """Least evidence (σ · m) of a path through its strongest place."""
     go_on: float = 3.0
     """Least evidence (σ · m) of a path through any of its places."""
+    way_m: float = 10.0
+    """The next place of a path is that of the best way of this length: with the reach of a step, 3.3 m, it stays within
+    the halo of a square."""
     beside_m: float = 0.25
     """A path leaves no second one within this distance."""
     gutter_m: float = 0.65
@@ -56,8 +60,13 @@ class Chain(NamedTuple):
     """A chain of places, in their direction."""
 
     places: Places
-    evidence: float
-    """Evidence (σ · m) of the places that belong to it alone."""
+    gains: Float64
+    """Evidence (σ · m) from each place to the next."""
+
+    @property
+    def evidence(self) -> float:
+        """Returns the evidence (σ · m) of the places that belong to it alone."""
+        return float(self.gains.sum())
 
 
 def paths_of(places: Places, settings: PathSettings = DEFAULT) -> list[Chain]:
@@ -79,7 +88,8 @@ def paths_of(places: Places, settings: PathSettings = DEFAULT) -> list[Chain]:
     ahead, behind = np.zeros(n), np.zeros(n)
     following, preceding = np.full(n, -1, np.int64), np.full(n, -1, np.int64)
     rounds = round(20.0 * settings.memory_m)
-    best_ways(links, lengths, gains, settings.memory_m, rounds, ahead, following, behind, preceding)
+    near = (settings.go_on, settings.way_m)
+    best_ways(links, lengths, gains, settings.memory_m, rounds, near, ahead, following, behind, preceding)
     total = ahead + behind
     ranked = np.lexsort((np.arange(n), -total))
     chain, owner = np.zeros((n, 2), np.int64), np.full(n, -1, np.int64)
@@ -89,15 +99,15 @@ def paths_of(places: Places, settings: PathSettings = DEFAULT) -> list[Chain]:
     )
     ends = np.searchsorted(chain[:length, 0], np.arange(number + 1))
     found = (chain[a:b, 1] for a, b in itertools.pairwise(ends))
-    chains = (Chain(places.at(rows), _own_evidence(place[rows], quality[rows], settings)) for rows in found)
+    chains = (Chain(places.at(rows), _gains(place[rows], quality[rows], settings)) for rows in found)
     return sorted((c for c in chains if c.evidence >= settings.begin), key=lambda c: -c.evidence)
 
 
-def _own_evidence(place: Float64, quality: Float64, settings: PathSettings) -> float:
-    """Returns the evidence (σ · m) of a chain's places; those that it shares with a stronger chain do not count."""
+def _gains(place: Float64, quality: Float64, settings: PathSettings) -> Float64:
+    """Returns the evidence (σ · m) from each place of a chain to the next; what a stronger chain has does not count."""
     length = np.hypot(*np.diff(place[:, :2], axis=0).T)
     free = np.minimum(length, FREE_M)
-    return float(np.sum(free * 0.5 * (quality[1:] + quality[:-1]) - (length - free) * settings.gap_cost))
+    return np.asarray(free * 0.5 * (quality[1:] + quality[:-1]) - (length - free) * settings.gap_cost)
 
 
 def _bins(places: Places, size_m: float) -> tuple[Int64, Int64, tuple[float, float, float, float, float]]:
@@ -192,6 +202,15 @@ def chain_line(chain: Chain) -> Float64:
     return even_nodes(np.column_stack(chain.places[:2]), NODE_M)
 
 
+def evidence_at(line: Float64, chain: Chain) -> Float64:
+    """Returns the evidence (n,) (σ · m) of a chain's places about each of the points (n, 2) along it."""
+    places = np.column_stack(chain.places[:2])
+    total = np.append(0.0, np.cumsum(chain.gains))
+    at = total[scipy.spatial.cKDTree(places).query(line)[1]]
+    middles = 0.5 * (at[1:] + at[:-1])
+    return np.diff(np.concatenate([total[:1], middles, total[-1:]]))
+
+
 def nodes_of(line: Float64, heights: Heights, raster: HeightRaster, slopes: tuple[Float64, Float64]) -> Nodes:
     """Returns nodes of a line (k, 2), each with the step that its surroundings show; the higher side is the right one.
 
@@ -265,19 +284,19 @@ def even_nodes(places: Float64, distance_m: float) -> Float64:
 
     Nodes lie where the line crosses a lattice of the map, and evenly between: wherever a square lets it begin.
     """
-    path = _stops(places, 0.1)
+    path = stops(places, 0.1, _LATTICE_M)
     if len(path) >= 3:
         # Mirrored about the end points, which so stay fixed.
         more = min(len(path) - 1, 12)
         before, behind = 2.0 * path[:1] - path[more:0:-1], 2.0 * path[-1:] - path[-2 : -2 - more : -1]
         path = scipy.ndimage.gaussian_filter1d(np.concatenate([before, path, behind]), 3.0, axis=0)[more:-more]
-    return _stops(path, distance_m)
+    return stops(path, distance_m, _LATTICE_M)
 
 
-def _stops(places: Float64, distance_m: float) -> Float64:
-    """Returns points (k, 2) along places (n, 2): both ends, crossings of the lattice, and even ones between these."""
+def stops(places: Float64, distance_m: float, lattice_m: float) -> Float64:
+    """Returns points (k, 2) along places (n, 2): both ends, crossings of a lattice of the map, even ones between."""
     length, fixed = way_along(places), []
-    for at in places.T / _LATTICE_M:
+    for at in places.T / lattice_m:
         cell = np.floor(at)
         k = np.flatnonzero(np.diff(cell))
         share = (np.maximum(cell[k], cell[k + 1]) - at[k]) / (at[k + 1] - at[k])

@@ -8,6 +8,8 @@ from roadscan.compute.kernel_options import inlined, inner, kernel
 
 MAX_LINKS = 12
 """Most links from a place."""
+STRETCH_M = 0.1
+"""Ways are followed over whole stretches of this length (m), of which a link takes up at least one."""
 
 
 @inlined
@@ -76,10 +78,12 @@ def insert(links, lengths, gains, count, j, length, gain):
 
 
 @kernel
-def best_ways(links, lengths, gains, memory_m, rounds, ahead, following, behind, preceding):
+def best_ways(links, lengths, gains, memory_m, rounds, near, ahead, following, behind, preceding):
     """Fill `ahead` and `behind` (n,): the evidence of the best path from each place and to it; and the next places.
 
-    Evidence of what lies x metres away counts e^(−x / memory_m): the sum is that of a path of about `memory_m`.
+    Evidence of what lies x metres away counts e^(−x / memory_m): the sum is that of a path of about `memory_m`. The
+    next places are those of the best paths of a finite length, so that what lies farther away does not change a way.
+    near : (least evidence of places that paths lead through, that length (m)).
     following, preceding : (n,) the next place of the best way, −1 where it ends.
     """
     n = ahead.size
@@ -105,6 +109,50 @@ def best_ways(links, lengths, gains, memory_m, rounds, ahead, following, behind,
             at[to[m]] += 1
     _spread((starts, to, gain, fade), (begins, back_to), rounds, ahead, following)
     _spread((begins, back_to, back_gain, back_fade), (starts, to), rounds, behind, preceding)
+    strong = ahead + behind >= near[0]
+    stretches = int(near[1] / STRETCH_M + 0.5)
+    _follow((starts, to, gain, fade), memory_m, strong, stretches, following)
+    _follow((begins, back_to, back_gain, back_fade), memory_m, strong, stretches, preceding)
+
+
+@inner
+def _follow(ways, memory_m, strong, stretches, following):
+    """Fill `following` (n,) with the next place on the best path of some stretches from each strong place."""
+    starts, to, gain, fade = ways
+    places = np.flatnonzero(strong)
+    row = np.full(strong.size, -1)
+    row[places] = np.arange(places.size)
+    first = np.zeros(places.size + 1, np.int64)
+    number = 0
+    for a in range(places.size):
+        for m in range(starts[places[a]], starts[places[a] + 1]):
+            number += row[to[m]] >= 0
+        first[a + 1] = number
+    next_row, links, span = np.empty(number, np.int64), np.empty((number, 2)), np.empty(number, np.int64)
+    longest, at = 1, 0
+    for a in range(places.size):
+        following[places[a]] = -1
+        for m in range(starts[places[a]], starts[places[a] + 1]):
+            if row[to[m]] >= 0:
+                next_row[at], links[at, 0], links[at, 1] = row[to[m]], gain[m], fade[m]
+                span[at] = max(int(np.ceil(-memory_m * np.log(fade[m]) / STRETCH_M - 1e-6)), 1)
+                longest = max(longest, span[at])
+                at += 1
+    rows = longest + 1
+    value = np.zeros((rows, places.size))
+    for k in range(1, stretches + 1):
+        now = k % rows
+        for a in range(places.size):
+            best, then = 0.0, -1
+            for m in range(first[a], first[a + 1]):
+                if span[m] <= k:
+                    before = now - span[m] if span[m] <= now else now - span[m] + rows
+                    some = links[m, 0] + value[before, next_row[m]] * links[m, 1]
+                    if some > best:
+                        best, then = some, next_row[m]
+            value[now, a] = best
+            if k == stretches and then >= 0:
+                following[places[a]] = places[then]
 
 
 @inner
@@ -149,8 +197,10 @@ def _spread(ways, back, rounds, value, following):
 
 @kernel
 def trace(place, total, following, preceding, ranked, order, starts, bins, limits, chain, owner):
-    """Follow the best ways from the strongest places on; returns the number of chains.
+    """Follow the best ways through the strongest places; returns the number of chains.
 
+    The best way back from a place leads to where its chain begins, and the best way on from there is the chain. Ways on
+    from different beginnings meet and go on as one: so a chain does not depend on which of its places is strongest.
     total : (n,) evidence of the best path through each place. ranked : places, strongest first. order, starts, bins :
     places sorted by bin, as in :func:`find_links`. limits : (least evidence to begin, least evidence to go on,
     distances within which a chain leaves no second one and no other side of a gutter (m)). chain : (n, 2) filled, in
@@ -159,26 +209,19 @@ def trace(place, total, following, preceding, ranked, order, starts, bins, limit
     """
     n = total.size
     length, chains = 0, 0
-    way = np.empty(n, np.int64)
+    passed = np.full(n, -1, np.int64)
     for s in range(n):
         seed = ranked[s]
         if total[seed] < limits[0]:
             break
         if owner[seed] >= 0:
             continue
-        first = n
-        at = seed
-        # Back from the seed, filled from the end of `way`.
-        back = 0
-        while at >= 0 and owner[at] < 0 and total[at] >= limits[1] and back < n - 1:
-            owner[at] = chains
-            back += 1
-            way[first - back] = at
-            at = preceding[at]
-        for k in range(first - back, first):
-            chain[length, 0], chain[length, 1] = chains, way[k]
-            length += 1
-        at = following[seed]
+        first, at = seed, preceding[seed]
+        passed[seed] = s
+        while at >= 0 and owner[at] < 0 and total[at] >= limits[1] and passed[at] != s:
+            passed[at] = s
+            first, at = at, preceding[at]
+        at = first
         while at >= 0 and owner[at] < 0 and total[at] >= limits[1]:
             owner[at] = chains
             chain[length, 0], chain[length, 1] = chains, at

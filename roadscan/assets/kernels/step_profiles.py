@@ -12,6 +12,9 @@ QUARTERS = 4
 NEAR_M = 0.35  # Heights this near to the node (m) count for COVERED.
 HALF_BINS = 120
 """A profile reaches this many bins to each side."""
+TIE = 1e-6
+"""Rests that differ by less than this share are equal: rounding alone, which differs from scene to scene, would choose
+among the places of a step that lies where nothing was seen."""
 RESULTS = 11  # Number of columns.
 OFFSET, STEP, SIGMA_STEP, FACE, TOP, SCATTER, RETURNS, SEEN_LOW, SEEN_HIGH, SIGMA_OFFSET, COVERED = range(RESULTS)
 """Columns of what :func:`fit_nodes` fills, all in metres except the number of returns."""
@@ -123,13 +126,16 @@ def side_lines(profile, sums, ends, bounds, slope, precision, lines):
 
 @inlined
 def search_step(profile, sums, lines, search, prior, slope, out):
-    """Find offset and face of least rest, and fill a row of results; all candidates are compared over the same bins."""
+    """Find offset and face of least rest, and fill a row of results; all candidates are compared over the same bins.
+
+    Of neighbouring offsets with equal rests the middle one is taken.
+    """
     precision = (prior[1] / prior[0]) ** 2
     farthest, narrow, wide = int(search[0] / BIN_M), int(search[1] / BIN_M), int(search[2] / BIN_M)
     first, last = HALF_BINS - farthest - int(search[3] / BIN_M), HALF_BINS + farthest + int(search[3] / BIN_M)
     bounds = (HALF_BINS - farthest - wide // 2, HALF_BINS + farthest + wide - wide // 2)
     side_lines(profile, sums, (first, last), bounds, slope, precision, lines)
-    best, a, b = np.inf, -1, -1
+    best, width, least, most = np.inf, -1, 0, 0
     for face in range(narrow, wide + 1, 2):
         # A wider face must explain more than chance would.
         doubt = 1.0 + 0.002 * (face - narrow)
@@ -142,17 +148,21 @@ def search_step(profile, sums, lines, search, prior, slope, out):
             rest = lines[1, begin] + lines[4, end]
             for k in range(begin, end):
                 # It only grows.
-                if rest * doubt >= best:
+                if rest * doubt > best * (1.0 + TIE):
                     break
                 n = profile[0, k]
                 if n > 0.0:
                     z = low + (lines[6, k] - begin) / face * (high - low)
                     rest += max(profile[3, k] - 2.0 * z * profile[2, k] + n * z * z, 0.0)
             rest *= doubt
-            if rest < best:
-                best, a, b = rest, begin, end
-    if a < 0:
+            if rest < best * (1.0 - TIE):
+                best, width, least, most = rest, face, e, e
+            elif rest <= best * (1.0 + TIE) and face == width and e == most + 1:
+                most = e
+    if width < 0:
         return
+    a = HALF_BINS + (least + most) // 2 - width // 2
+    b = a + width
     low, slope_low, rest_low, n_low, var_low = line_between(sums, first, a, (a - HALF_BINS) * BIN_M, slope, precision)
     high, slope_high, rest_high, n_high, var_high = line_between(
         sums, b, last, (b - HALF_BINS) * BIN_M, slope, precision

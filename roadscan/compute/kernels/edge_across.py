@@ -86,3 +86,30 @@ def best_path(evidence, reach, shift_cost, total, before, path):
         for s in range(stations - 1, -1, -1):
             path[s] = o
             o = int(before[s, o])
+
+
+@kernel
+def best_places(evidence, reach, shift_cost, within, before, total, path):
+    """Fill `path` (stations,) with the offset (cells) through which the best path of a finite length about each leads.
+
+    within : stations on both sides that such a path takes in; what lies farther away does not count. before, total :
+    room for two rows (2, offsets) and for one. Other arguments as those of :func:`best_path`.
+    """
+    stations, offsets = evidence.shape
+    for s in range(stations):
+        total[:] = 0.0
+        for side in range(2):
+            first = max(s - within, 0) if side == 0 else min(s + within, stations - 1)
+            step, now = (1 if side == 0 else -1), 0
+            for o in range(offsets):
+                before[0, o] = evidence[first, o]
+            for k in range(first + step, s + step, step):
+                for o in range(offsets):
+                    best = -np.inf
+                    for j in range(max(o - reach, 0), min(o + reach + 1, offsets)):
+                        best = max(best, before[now, j] - shift_cost * abs(j - o))
+                    before[1 - now, o] = best + evidence[k, o]
+                now = 1 - now
+            total += before[now]
+        # The station itself counts on both sides.
+        path[s] = int(np.argmax(total - evidence[s]))

@@ -18,7 +18,7 @@ from roadscan.assets.kind import AssetKind, AssetObject, Evidence
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.panels import panels_of
 from roadscan.assets.upright.slices import touching
-from roadscan.compute.array_types import Bool, Float64, Int64
+from roadscan.compute.array_types import Bool, Float32, Float64, Int64
 from roadscan.core.extras import cv2
 from roadscan.core.strict import Strict
 
@@ -34,11 +34,36 @@ _LONG_M: Final = 2.0
 """Upright surfaces longer than this (m) are rails, fences and walls."""
 _WIDE: Final = np.ones((7, 7), np.uint8)
 """Walls, rails, kerbs and fences, with a cell to each side, are narrower than this (cells)."""
+_SMOOTH: Final = 2
+"""So many smooth cells in a square of that width are gaps between plants."""
+_SEEN_SHARE: Final = 0.5
+"""Share of the cells of such a square that must be seen, and rough."""
+_GAP: Final = np.ones((5, 5), np.uint8)
+"""Unseen cells between grown ones are filled in gaps narrower than this (cells): 1 m, as rings of sparse scanners leave
+them."""
+_WALL_M: Final = (1.0, 2.5)
+"""Heights above the ground at which a wall stands (m): lower lie plants, and higher hang crowns."""
+_CORE: Final = np.ones((5, 5), np.uint8)
+"""Cells that are this far within an area, and so pool none outside, tell its level."""
+_LEVELS: Final = 15
+"""Edge of the square in which both sides of an edge are compared (cells): 3.75 m."""
+_WHOLE_SHARE: Final = 1000.0
+"""Shares are counted in thousandths, whose sums are exact."""
+_MOST: Final = 0.5
+"""Share of a cell's low returns that must lie on the road, so that it is no bed's."""
+_RIM: Final = 3
+"""Cells that a rim may be wide: what a beam returns behind the top of plants lies up to 0.75 m behind it."""
+_RIM_LEVELS: Final = 7
+"""Edge of the square whose grown cells tell how many returns one has (cells)."""
+_THIN: Final = 0.4
+"""A cell at the rim with less than this share of the returns of those around it is thin."""
+_CROSS: Final = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
+"""A cell and those that share a side with it."""
 _MARGIN_M: Final = 15.0
-"""Cells are judged so far beyond a tile (m): openings and pools reach three metres."""
+"""Cells are judged so far beyond a tile (m), or as far as the kind reaches."""
 _LARGEST_HOLE_M2: Final = 0.5  # Smaller holes in green ground are dry patches (m²).
 _POOLED: Final = np.ones((3, 3), np.uint8)
-"""A cell is judged with those around it, which widens areas by one."""
+"""A cell is judged with those around it, which widens areas by up to one."""
 PIECE_SCHEMA: Final = pa.schema(
     [
         ("column", pa.int64()), ("row", pa.int64()), ("height_m", pa.float64()), ("probability", pa.float64()),
@@ -61,7 +86,7 @@ class LandscapeOptions(Strict):
 def grown_cells(scene: Scene, options: LandscapeOptions) -> pa.Table:
     """Returns cells of the tile that are probably grown over: areas whose heights scatter more than the road's.
 
-    Long upright surfaces are excluded, and an opening removes narrow areas.
+    Long upright surfaces are excluded, and so are narrow areas.
     """
     tile, window = scene.tile, scene.window
     margin = int(min(tile.x_min_m - window.x_min_m, _MARGIN_M) / CELL_M)
@@ -69,21 +94,83 @@ def grown_cells(scene: Scene, options: LandscapeOptions) -> pa.Table:
     inner = tuple(round((high - low) / CELL_M) for low, high in
                   ((tile.y_min_m, tile.y_max_m), (tile.x_min_m, tile.x_max_m)))  # fmt: skip
     shape = (inner[0] + 2 * margin, inner[1] + 2 * margin)
-    sums = _sums(scene, _flat_ones(scene), corner, shape)
+    flat = _flat_ones(scene)
+    sums = _sums(scene, flat, corner, shape)
     counted, rough = _roughness(sums)
     road = _cells_with(scene, classes.ROAD, corner, shape) & counted
     even = road_roughness_m(scene, rough, road)
     if even is None:
         return PIECE_SCHEMA.empty_table()
     ratio = rough / even
-    chosen = (counted & (ratio >= options.rough_ratio)).astype(np.uint8)
-    walls = _cells_with(scene, classes.BUILDING, corner, shape).view(np.uint8)
-    chosen[cv2.dilate(walls, _POOLED, iterations=2) > 0] = 0
-    chosen = cv2.erode(cv2.morphologyEx(chosen, cv2.MORPH_OPEN, _WIDE), _POOLED)
-    grown = (chosen > 0) & ~road & (sums[..., 0] > 0)
-    edge = np.zeros(shape, np.bool_)
-    edge[margin : margin + inner[0], margin : margin + inner[1]] = True
-    return _table(scene, grown & edge, ratio / options.rough_ratio, corner)
+    wall = _cells_with(scene, classes.BUILDING, corner, shape, _WALL_M).view(np.uint8)
+    wall = cv2.dilate(wall, _POOLED, iterations=2) > 0
+    is_rough = counted & (ratio >= options.rough_ratio) & ~wall
+    wide = _wide_ones(is_rough, (counted & ~is_rough) | wall, counted)
+    off = np.abs(scene.above_ground_m) > options.rough_ratio * even
+    share = _sums(scene, flat, corner, shape, off.astype(np.float32))[..., 3]
+    driven = (scene.classes == classes.ROAD).astype(np.float32)
+    every = _sums(scene, np.ones(flat.size, np.bool_), corner, shape, driven)
+    is_road = counted & (every[..., 3] >= _MOST * every[..., 0])
+    grown = _up_to_edge(wide, is_rough, counted & ~is_rough & ~wall, sums[..., 0], share) & ~is_road
+    unseen = sums[..., 0] == 0
+    grown = grown | (_closed(grown) & wide & unseen)
+    inside = np.zeros(shape, np.bool_)
+    inside[margin : margin + inner[0], margin : margin + inner[1]] = True
+    grown = _without_thin_rim(grown, every[..., 0])
+    return _table(scene, grown, inside, ratio / options.rough_ratio, corner)
+
+
+def _closed(cells: Bool) -> Bool:
+    """Returns cells (rows, columns) with the gaps between them."""
+    return np.asarray(cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_CLOSE, _GAP) > 0)
+
+
+def _number_in(cells: Float64 | Bool, size: int) -> Float64:
+    """Returns sums (rows, columns) over squares of `size` cells of whole numbers, which any square adds up alike."""
+    return np.asarray(
+        cv2.boxFilter(cells.astype(np.float64), -1, (size, size), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    )
+
+
+def _wide_ones(rough: Bool, smooth: Bool, counted: Bool) -> Bool:
+    """Returns cells (rows, columns) of rough ground that is wide.
+
+    Cells that too few returns hit speak for neither side: those between rough ones belong to them.
+    """
+    size = _WIDE.shape[0]
+    fits = (_number_in(smooth, size) <= _SMOOTH) & (_number_in(rough, size) >= _SEEN_SHARE * size**2)
+    wide = (cv2.dilate(fits.view(np.uint8), _WIDE) > 0) & rough
+    return np.asarray(_closed(wide) & (wide | ~counted))
+
+
+def _up_to_edge(wide: Bool, rough: Bool, smooth: Bool, number: Float64, off: Float64) -> Bool:
+    """Returns those of some cells (rows, columns) that lie on the grown side of the edge.
+
+    It lies midway between the share of returns that are off the ground (`off`, of the `number` in a cell) within the
+    area and on smooth ground beside it. Cells count alike: the front of a bed returns many more beams than the ground.
+    """
+    seen = number > 0
+    share = _number_in(np.rint(_WHOLE_SHARE * off / np.maximum(number, 1.0)), 3) / np.maximum(_number_in(seen, 3), 1.0)
+    share = np.rint(share)
+    within = (cv2.erode(wide.view(np.uint8), _CORE) > 0) & (rough | smooth)
+    beside = smooth & ~(cv2.dilate(wide.view(np.uint8), _POOLED) > 0)
+    levels, known = [], []
+    for cells in (within, beside):
+        known.append(_number_in(cells, _LEVELS))
+        levels.append(_number_in(np.where(cells, share, 0.0), _LEVELS) / np.maximum(known[-1], 1.0))
+    return np.asarray(wide & seen & ((share >= 0.5 * (levels[0] + levels[1])) | (known[0] == 0.0)))
+
+
+def _without_thin_rim(grown: Bool, number: Float64) -> Bool:
+    """Returns cells (rows, columns) without those at the rim that few returns hit.
+
+    Behind the top of plants or a rail a beam whose halves meet both returns from a place between them, on nothing.
+    """
+    for _ in range(_RIM):
+        around = _number_in(np.where(grown, number, 0.0), _RIM_LEVELS) / np.maximum(_number_in(grown, _RIM_LEVELS), 1.0)
+        rim = grown & ~(cv2.erode(grown.view(np.uint8), _CROSS, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0)
+        grown = grown & ~(rim & (number < _THIN * around))
+    return grown
 
 
 def roughness_of_road_m(scene: Scene) -> float | None:
@@ -124,19 +211,26 @@ def _flat_ones(scene: Scene) -> Bool:
     return counted
 
 
-def _sums(scene: Scene, counted: Bool, corner: Float64, shape: tuple[int, int]) -> Float64:
+def _sums(
+    scene: Scene, counted: Bool, corner: Float64, shape: tuple[int, int], values: Float32 | None = None
+) -> Float64:
+    """Returns sums (rows, columns, 4) over the low returns of cells that count: n, Σh, Σh², and Σ of values (n,)."""
     returns = scene.returns
     sums = np.zeros((*shape, 4))
     limits = np.array(_LOW_M)
-    low_moments(
-        returns.x_m, returns.y_m, scene.above_ground_m, returns.intensity, counted, limits, corner, CELL_M, sums
-    )
+    values = returns.intensity if values is None else values
+    low_moments(returns.x_m, returns.y_m, scene.above_ground_m, values, counted, limits, corner, CELL_M, sums)
     return sums
 
 
-def _cells_with(scene: Scene, code: int, corner: Float64, shape: tuple[int, int]) -> Bool:
-    """Returns a mask (rows, columns) of cells with returns of a class."""
+def _cells_with(
+    scene: Scene, code: int, corner: Float64, shape: tuple[int, int], between_m: tuple[float, float] | None = None
+) -> Bool:
+    """Returns a mask (rows, columns) of cells with returns of a class, at some heights above the ground (m)."""
     rows = np.flatnonzero(scene.classes == code)
+    if between_m is not None:
+        above = scene.above_ground_m[rows]
+        rows = rows[(above >= between_m[0]) & (above <= between_m[1])]
     grid = (float(corner[0]), float(corner[1]), CELL_M)
     cell = cells_of(scene.returns.x_m[rows], scene.returns.y_m[rows], grid, shape)
     out = np.zeros(shape[0] * shape[1], np.bool_)
@@ -144,32 +238,42 @@ def _cells_with(scene: Scene, code: int, corner: Float64, shape: tuple[int, int]
     return out.reshape(shape)
 
 
-def _table(scene: Scene, chosen: Bool, ratio: Float64, corner: Float64) -> pa.Table:
-    """Returns rows of the chosen cells, by row and column."""
-    returns, columns = scene.returns, chosen.shape[1]
+def _table(scene: Scene, grown: Bool, inside: Bool, ratio: Float64, corner: Float64) -> pa.Table:
+    """Returns rows of the grown cells that lie inside, by row and column."""
+    returns, columns = scene.returns, grown.shape[1]
     low = np.flatnonzero((scene.above_ground_m >= _LOW_M[0]) & (scene.above_ground_m <= _LOW_M[1]))
     grid = (float(corner[0]), float(corner[1]), CELL_M)
-    cell = cells_of(returns.x_m[low], returns.y_m[low], grid, chosen.shape)
-    held = np.flatnonzero(chosen.ravel())
-    number = np.full(chosen.size + 1, -1, np.int32)
-    number[held] = np.arange(held.size)
-    starts, order = in_bins(number[cell], held.size)
-    row, column = held // columns, held % columns
+    cell = cells_of(returns.x_m[low], returns.y_m[low], grid, grown.shape)
+    # What no return hit is as what lies up to two cells from it, beyond the tile too.
+    some = np.flatnonzero(grown & (cv2.dilate(inside.view(np.uint8), _GAP) > 0))
+    number = np.full(grown.size + 1, -1, np.int32)
+    number[some] = np.arange(some.size)
+    starts, order = in_bins(number[cell], some.size)
+    row, column = some // columns, some % columns
     middle = [corner[k] + (v + 0.5) * CELL_M for k, v in enumerate((column, row))]
     height = scene.ground.height_at(*middle)
-    kept = np.flatnonzero(np.isfinite(height) & (np.diff(starts) > 0))
-    rows = low[order]
-    epochs, passes = returns.epoch_gps_ns[rows], returns.pass_id[rows]
-    spans = [(int(starts[k]), int(starts[k + 1])) for k in kept]
-    east, north = (round((returns.corner_m[k] + corner[k]) / CELL_M) for k in (0, 1))
+    rows, count = low[order], np.diff(starts)
+    epochs, seen_by = returns.epoch_gps_ns[rows], returns.pass_id[rows]
     probability = ratio[row, column] ** 2 / (1.0 + ratio[row, column] ** 2)
+    first, last = np.zeros(some.size, np.int64), np.zeros(some.size, np.int64)
+    passes: list[list[int]] = [[] for _ in range(some.size)]
+    for k in np.flatnonzero(count).tolist():
+        span = slice(int(starts[k]), int(starts[k + 1]))
+        first[k], last[k] = epochs[span].min(), epochs[span].max()
+        passes[k] = np.unique(seen_by[span]).tolist()
+    for k in np.flatnonzero(count == 0).tolist():
+        near = np.flatnonzero((count > 0) & (np.abs(row - row[k]) <= 2) & (np.abs(column - column[k]) <= 2))
+        if near.size:
+            first[k], last[k], probability[k] = first[near].min(), last[near].max(), np.mean(probability[near])
+            passes[k] = sorted({one for other in near.tolist() for one in passes[other]})
+    kept = np.flatnonzero(np.isfinite(height) & inside[row, column] & np.array([len(p) > 0 for p in passes], np.bool_))
+    east, north = (round((returns.corner_m[k] + corner[k]) / CELL_M) for k in (0, 1))
     return pa.table(
         {
             "column": east + column[kept], "row": north + row[kept], "height_m": height[kept],
-            "probability": probability[kept], "returns": np.diff(starts)[kept],
-            "passes": pa.array([np.unique(passes[a:b]).tolist() for a, b in spans], pa.list_(pa.int32())),
-            "first_epoch_gps_ns": np.array([int(epochs[a:b].min()) for a, b in spans], np.int64),
-            "last_epoch_gps_ns": np.array([int(epochs[a:b].max()) for a, b in spans], np.int64),
+            "probability": probability[kept], "returns": count[kept],
+            "passes": pa.array([passes[k] for k in kept.tolist()], pa.list_(pa.int32())),
+            "first_epoch_gps_ns": first[kept], "last_epoch_gps_ns": last[kept],
         },
         PIECE_SCHEMA,
     )  # fmt: skip
@@ -203,6 +307,20 @@ def area_of(column: Int64, row: Int64, cell_m: float = CELL_M) -> shapely.Geomet
     return shapely.union_all(runs, grid_size=1e-3)
 
 
+def through_middles(shape: shapely.Geometry) -> shapely.Geometry:
+    """Returns an area of cells whose outline goes through the middles of the cells' sides.
+
+    So steps lie at both sides of a slant line, half a cell away, and simplifying shifts no side by a whole one.
+    """
+    parts = []
+    sides = shapely.segmentize(shape, 1.01 * CELL_M)
+    for one in getattr(sides, "geoms", [sides]):
+        rings = [shapely.get_coordinates(ring) for ring in (one.exterior, *one.interiors)]
+        rings = [0.5 * (ring[:-1] + ring[1:]) for ring in rings]
+        parts.append(shapely.Polygon(rings[0], rings[1:]))
+    return parts[0] if len(parts) == 1 else shapely.MultiPolygon(parts)
+
+
 class Outline(NamedTuple):
     """The shape of an area on the map (m), by how much it may be simplified, and 1 σ of its edge (m)."""
 
@@ -215,10 +333,10 @@ def outline_of(pieces: pa.Table, cells: Int64) -> Outline:
     """Returns the outline of some cells; parts of cells are known of those that pictures show."""
     column, row = (np.asarray(pieces[name])[cells] for name in ("column", "row"))
     if "mask" not in pieces.column_names:
-        return Outline(area_of(column, row), 1.04 * CELL_M, CELL_M)
+        return Outline(through_middles(area_of(column, row)), 0.52 * CELL_M, CELL_M)
     mask, sigma = (np.asarray(pieces[name])[cells] for name in ("mask", "sigma_m"))
     if (mask == WHOLE).all() and (sigma == CELL_M).all():
-        return Outline(area_of(column, row), 1.04 * CELL_M, CELL_M)
+        return Outline(through_middles(area_of(column, row)), 0.52 * CELL_M, CELL_M)
     bit = np.arange(FINE * FINE)
     held, part = np.nonzero((mask[:, None] >> bit) & 1)
     fine = column[held] * FINE + part % FINE, row[held] * FINE + part // FINE
@@ -264,6 +382,7 @@ class LandscapeArea(AssetKind):
     options = LandscapeOptions
     piece_schema = PIECE_SCHEMA
     sees_green = True
+    reach_m = 9.0
 
     def evidence(self, scene: Scene, options: LandscapeOptions) -> Evidence:
         """Returns cells of the tile."""

@@ -21,13 +21,22 @@ KIND = LandscapeArea()
 
 
 @functools.cache
-def street() -> Scene:
-    """A road of 16 m width seen each 5 cm with 5 mm of noise; on its side a bed 0.1–0.3 m high, and a rail above it."""
+def street(every_m: float = 0.05, shade_m: float = 0.0) -> Scene:
+    """A road of 16 m width seen with 5 mm of noise; on its side a bed 0.1–0.3 m high, and a rail above it.
+
+    every_m : from ring to ring, which lie along the road; a ring has a return each 5 cm. shade_m : so far behind the
+    bed no return reaches the ground; one in ten is a mixture of the bed's top and of the ground behind.
+    """
     rng = np.random.default_rng(3)
-    x, y = (a.ravel() for a in np.meshgrid(np.arange(0.0, 20.0, 0.05), np.arange(-10.0, 10.0, 0.05)))
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(0.0, 20.0, 0.05), np.arange(-10.0, 10.0, every_m)))
     x, y = x + rng.uniform(-0.02, 0.02, x.size), y + rng.uniform(-0.02, 0.02, y.size)
+    behind = y - BED.bounds[3]
+    shaded = (x > BED.bounds[0]) & (x < BED.bounds[2]) & (behind > 0.0) & (behind < shade_m)
+    seen = ~shaded | (rng.random(x.size) < 0.1)
+    x, y, behind, shaded = x[seen], y[seen], behind[seen], shaded[seen]
     z = 100.0 - 0.02 * np.abs(y) + rng.normal(0.0, 0.005, x.size)
     z += np.where(shapely.contains_xy(BED, x, y), rng.uniform(0.0, 0.3, x.size), 0.0)
+    z += np.where(shaded, rng.uniform(0.0, 0.2, x.size) * (1.0 - behind / max(shade_m, 0.1)), 0.0)
     rail = np.column_stack([np.arange(0.0, 20.0, 0.01), np.full(2000, -6.0), 99.9 + rng.uniform(0.0, 0.7, 2000)])
     points = np.concatenate([np.column_stack([x, y, z]), rail])
     sensor = np.column_stack([points[:, 0], np.full(len(points), -2.0), np.full(len(points), 102.0)])
@@ -59,3 +68,20 @@ def test_an_area_does_not_depend_on_where_tiles_are_cut() -> None:
         parts.append(KIND.evidence(tile, KIND.options()).pieces)
     (joined,) = areas(pa.concat_tables(parts))
     assert shapely.force_2d(joined.geometry).symmetric_difference(shapely.force_2d(whole.geometry)).area < 0.3
+
+
+@pytest.mark.parametrize("every_m", [0.2, 0.6, 0.8])
+def test_a_bed_is_found_between_the_rings_of_a_sparse_scanner(every_m: float) -> None:
+    (one,) = areas(KIND.evidence(street(every_m), KIND.options()).pieces)
+    both = shapely.force_2d(one.geometry).intersection(BED).area
+    # Each long side lies somewhere between two rings.
+    assert both / BED.area >= 0.97 - every_m / (BED.bounds[3] - BED.bounds[1])
+    assert both / one.geometry.area >= 0.90
+    assert one.geometry.is_valid
+
+
+def test_mixed_returns_behind_a_bed_are_none_of_it() -> None:
+    (one,) = areas(KIND.evidence(street(0.05, 1.0), KIND.options()).pieces)
+    both = shapely.force_2d(one.geometry).intersection(BED).area
+    assert both / BED.area >= 0.90
+    assert both / one.geometry.area >= 0.95

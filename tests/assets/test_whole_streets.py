@@ -24,6 +24,7 @@ SHARES = (
     "type right",
 )
 
+
 @pytest.mark.parametrize("name", SCENES)
 def test_a_whole_street(name: str, tmp_path: Path) -> None:
     missed = {}

@@ -227,7 +227,7 @@ def _one_side(track: Track, right: bool, scene: Scene, kerbs: shapely.STRtree) -
     by_kerb = scipy.ndimage.median_filter((near & up).any(axis=1).astype(np.float64), 5)
     by_barrier = scipy.ndimage.median_filter((near & stands).any(axis=1).astype(np.float64), 5)
     lines = np.column_stack([np.take_along_axis(a, found.cell[:, None], axis=1)[:, 0] for a in (x, y)])
-    good = (found.evidence >= LEAST_EVIDENCE) & np.take_along_axis(inside, found.cell[:, None], axis=1)[:, 0]
+    good = (found.evidence.round(6) >= LEAST_EVIDENCE) & np.take_along_axis(inside, found.cell[:, None], axis=1)[:, 0]
     for rows in _runs(good, found.cell, moved_cells(raster.cell_m)):
         line = _snapped(smooth_line(lines[rows], np.ones(len(rows))), by_kerb[rows] > 0.5, kerbs)
         level = _road_level(line, out[rows], beside, scene)

@@ -22,7 +22,7 @@ from roadscan.assets.edges.steps import HeightRaster, raster_of, step_places
 from roadscan.assets.judgement.judge import Judge
 from roadscan.assets.kernels.columns import mark_corridor
 from roadscan.assets.scene import Scene, once_a_scene
-from roadscan.compute.array_types import Bool, Float64, Int64
+from roadscan.compute.array_types import Bool, Float64
 from roadscan.core.extras import cv2
 
 
@@ -225,14 +225,6 @@ _AROUND_NODES: Final = 7
 """Features are medians over this many nodes (3 m): an edge is what it is over a length, not at a point."""
 _BESIDE_M: Final = 0.7  # Returns this near to a node (m) tell of its sides …
 _FACE_M: Final = 0.08  # … unless they are nearer to the edge than this (m): those are on its face.
-_FRONT_M: Final = 0.4  # The face and the top of a step are looked at so far from its line (m).
-_LEAVES_M: Final = 0.07
-"""1 σ (m) across a line of the returns between a quarter and three quarters of a step's height, from which it is the
-front of plants: noise, passes that differ and a bevelled face stay below."""
-_ROUGH_M: Final = 0.025
-"""1 σ (m) of heights beside its upper edge, from which leaves are there and no paving."""
-_ROUGH_RATIO: Final = 3.0
-"""It is so many times that of the road, too, as of landscape areas: passes that differ are rough everywhere."""
 _STANDING_M: Final = (0.3, 2.0)
 """Heights above the ground (m) at which fences, walls and hedges are seen."""
 _PLANTS_M: Final = (0.05, 0.3)  # Heights above the ground (m) of grass and of the lower parts of plants.
@@ -287,8 +279,13 @@ def _of_returns(scene: Scene, place: Float64) -> dict[str, Float64]:
     `crossing` is the mean cosine between beams and the edge: 0 where the edge lies along the ring that a laser draws.
     """
     raster, returns, count = raster_of(scene), scene.returns, len(place)
-    rows, owner, across = _beside(scene, place)
-    ux, uy = place[owner, 2:].T
+    rows = np.flatnonzero(_near(place, raster)[np.maximum(raster.cell, 0)] & (raster.cell >= 0))
+    away, owner = scipy.spatial.cKDTree(place[:, :2]).query(
+        np.column_stack([returns.x_m[rows], returns.y_m[rows]]), distance_upper_bound=_BESIDE_M
+    )
+    rows, owner = rows[np.isfinite(away)], owner[np.isfinite(away)].astype(np.int64)
+    x, y, ux, uy = place[owner].T
+    across = (returns.x_m[rows] - x) * uy - (returns.y_m[rows] - y) * ux
     above = scene.above_ground_m[rows]
 
     def share(of: tuple[float, float], among: Bool) -> Float64:
@@ -308,58 +305,6 @@ def _of_returns(scene: Scene, place: Float64) -> dict[str, Float64]:
            for side, own in sides.items()},
         "crossing": np.where(number > 0, total / np.maximum(number, 1), np.nan),
     }  # fmt: skip
-
-
-def _beside(scene: Scene, place: Float64) -> tuple[Int64, Int64, Float64]:
-    """Returns numbers (k,) of the returns beside nodes, the node of each, and how far to its right the return lies."""
-    raster, returns = raster_of(scene), scene.returns
-    rows = np.flatnonzero(_near(place, raster)[np.maximum(raster.cell, 0)] & (raster.cell >= 0))
-    away, owner = scipy.spatial.cKDTree(place[:, :2]).query(
-        np.column_stack([returns.x_m[rows], returns.y_m[rows]]), distance_upper_bound=_BESIDE_M
-    )
-    rows, owner = rows[np.isfinite(away)], owner[np.isfinite(away)].astype(np.int64)
-    x, y, ux, uy = place[owner].T
-    return rows, owner, (returns.x_m[rows] - x) * uy - (returns.y_m[rows] - y) * ux
-
-
-def _planted(scene: Scene, edges: Sequence[Edge]) -> Bool:
-    """Returns a mask (n,) of the nodes of edges that are the front of plants.
-
-    Its beams end on many leaves, far into the bed, and its top is rough; on the face of a kerb they end on one surface.
-    """
-    joined = Nodes(*map(np.concatenate, zip(*(edge.nodes for edge in edges), strict=True)))
-    place = np.column_stack([joined.x_m, joined.y_m, joined.heading_x, joined.heading_y])
-    rows, owner, across = _beside(scene, place)
-    fixed = np.ones(256, np.bool_)
-    fixed[list(_PASSING)] = False
-    some = fixed[scene.classes[rows]] & (np.abs(across) <= _FRONT_M)
-    rows, owner, across = rows[some], owner[some], across[some]
-    foot, step = joined.top_m[owner] - joined.step_m[owner], joined.step_m[owner]
-    share = (scene.returns.height_m[rows] - foot) / np.where(step > 0.0, step, np.nan)
-    face, top = (share > 0.25) & (share < 0.75), (across > _FACE_M) & (share > -0.5) & (share < 2.5)
-    count = len(place)
-    front = _spread_of(across[face], owner[face], count)
-    rough = _spread_of(scene.returns.height_m[rows[top]], owner[top], count)
-    ends = np.cumsum([len(edge.seen) for edge in edges])
-    front, rough = (
-        np.concatenate([_medians_of_known(column[end - len(e.seen) : end]) for e, end in zip(edges, ends, strict=True)])
-        for column in (front, rough)
-    )
-    even_m = scene.statistics.known("road_roughness_m") or 0.0
-    return np.asarray((front > _LEAVES_M) & (rough > max(_ROUGH_M, _ROUGH_RATIO * even_m)))
-
-
-def _spread_of(values: Float64, owner: Int64, count: int) -> Float64:
-    """Returns half the distance (count,) between quantiles 0.16 and 0.84 of each owner's values; NaN below five."""
-    order = np.lexsort((values, owner))
-    number = np.bincount(owner, minlength=count)
-    first = np.cumsum(number) - number
-    ordered = np.append(values[order], 0.0)
-    low, high = (
-        ordered[np.minimum(first + np.floor(q * np.maximum(number - 1, 0)).astype(np.int64), len(values))]
-        for q in (0.16, 0.84)
-    )
-    return np.where(number >= 5, 0.5 * (high - low), np.nan)
 
 
 def _near(place: Float64, raster: HeightRaster) -> Bool:
@@ -393,7 +338,6 @@ _LEAST_RETURNS: Final = 2  # An object has at least this many returns in a cell.
 _MOST: Final = 0.5  # Share of an edge's nodes from which it counts as taken.
 _FOOT_NODES: Final = 12  # Nodes (6 m) to both sides over which that share is taken.
 _VEHICLE_M: Final = 0.9  # Half of a vehicle's width (m).
-_PASSING: Final = (classes.VEHICLE, classes.PERSON, classes.LOW_NOISE, classes.HIGH_NOISE)
 _OTHERS: Final = (
     classes.VEHICLE, classes.PERSON, classes.LOW_NOISE, classes.HIGH_NOISE, classes.LOW_VEGETATION,
     classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION,
@@ -407,7 +351,7 @@ def free_edges(scene: Scene) -> list[Edge]:
     edges = open_edges(scene)
     if not edges:
         return []
-    stated = np.where(_planted(scene, edges), 0.0, KERB.probability(node_features(scene, edges)))
+    stated = KERB.probability(node_features(scene, edges))
     ends = np.cumsum([len(edge.seen) for edge in edges])
     return [part for edge, end in zip(edges, ends, strict=True)
             for part in kerb_parts(edge, stated[end - len(edge.seen) : end])]  # fmt: skip

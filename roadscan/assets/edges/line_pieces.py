@@ -45,6 +45,7 @@ def line_schema(columns: Sequence[str]) -> pa.Schema:
 LINE_PIECES: Final = line_schema(NODE_COLUMNS)
 """Columns of a piece: a value a node in the direction of the line (higher side to the right), what saw it, and whether
 its ends lie on the tile's border. `seen` is 1 for nodes whose step was measured; `probability` is that of a kerb."""
+_SAME_M: Final = 0.001  # Ends so near to each other (m) are those of one cut.
 JOIN_M: Final = 0.5
 """Greatest distance (m) between the ends of two tiles' lines on their border."""
 SAME_M: Final = 1e-3
@@ -277,7 +278,7 @@ def _partners(lines: Sequence[Line], lasts: Sequence[int], firsts: Sequence[int]
         (float(np.hypot(*(ends[i] - begins[j]))), lasts[i], firsts[j])
         for i, near in enumerate(tree.query_ball_point(ends, JOIN_M))
         for j in near
-        if lasts[i] != firsts[j] and _direction(lines[lasts[i]], -1) @ _direction(lines[firsts[j]], 0) > 0.7
+        if lasts[i] != firsts[j] and _goes_on(lines[lasts[i]], lines[firsts[j]])
     )
     after: dict[int, int] = {}
     taken: set[int] = set()
@@ -286,6 +287,12 @@ def _partners(lines: Sequence[Line], lasts: Sequence[int], firsts: Sequence[int]
             after[i] = j
             taken.add(j)
     return after
+
+
+def _goes_on(a: Line, b: Line) -> bool:
+    """Returns whether a line goes on in another: from the same place, whatever corner is there, or straight on."""
+    same = float(np.hypot(*(a.nodes[-1, :2] - b.nodes[0, :2]))) <= _SAME_M
+    return same or bool(_direction(a, -1) @ _direction(b, 0) > 0.7)
 
 
 def _direction(line: Line, end: int) -> Float64:
@@ -384,6 +391,10 @@ def polygon_of(strip: Strip) -> shapely.Polygon | None:
     return ribbon(inner, np.column_stack([x, y, np.where(np.isfinite(height), height, inner[:, 2])]))
 
 
+_HOLE_M2: Final = 0.5
+"""Smaller holes of a ribbon (m²) are left by rounding; a ribbon around a roundabout has a large one."""
+
+
 def ribbon(inner: Float64, outer: Float64) -> shapely.Polygon | None:
     """Returns the polygon with heights between two lines (n, 3) of facing points; None where it has no area.
 
@@ -396,10 +407,13 @@ def ribbon(inner: Float64, outer: Float64) -> shapely.Polygon | None:
     parts = [g for g in getattr(whole, "geoms", [whole]) if g.geom_type == "Polygon" and g.area > 0.0]
     if not parts:
         return None
-    ring = shapely.get_coordinates(shapely.simplify(max(parts, key=lambda g: g.area).exterior, 0.02))
+    largest = max(parts, key=lambda g: g.area)
+    holes = [ring for ring in largest.interiors if shapely.Polygon(ring).area >= _HOLE_M2]
     known = np.concatenate([inner, outer])
-    nearest = scipy.spatial.cKDTree(known[:, :2]).query(ring)[1]
-    return shapely.Polygon(np.column_stack([ring, known[nearest, 2]]))
+    tree = scipy.spatial.cKDTree(known[:, :2])
+    rings = [shapely.get_coordinates(shapely.simplify(ring, 0.02)) for ring in (largest.exterior, *holes)]
+    shell, *inside = (np.column_stack([ring, known[tree.query(ring)[1], 2]]) for ring in rings)
+    return shapely.Polygon(shell, inside)
 
 
 def running_slope(strip: Strip, over_m: float = 2.0) -> float | None:

@@ -23,6 +23,10 @@ FREE_M: Final = 0.3
 """Distance of consecutive places (m) that is no gap."""
 
 
+REACH_M: Final = 14.0
+"""What lies farther from a square (m) does not change its kerbs: the way of a path, the reach of a step, and a node."""
+
+
 class PathSettings(NamedTuple):
     """How places become paths. One setting for all data."""
 

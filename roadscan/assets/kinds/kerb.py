@@ -17,6 +17,7 @@ from pydantic import Field
 from roadscan.assets import classes
 from roadscan.assets.edges.find import free_edges
 from roadscan.assets.edges.line_pieces import LINE_PIECES, Line, columns_of, cut_at, dense, joined_lines, pieces_table
+from roadscan.assets.edges.profiles import REACH_M
 from roadscan.assets.edges.steps import HeightRaster, raster_of
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, Marked
 from roadscan.assets.scene import Scene
@@ -55,6 +56,7 @@ class Kerb(AssetKind):
     curve: ClassVar[str] = "products"
     options: ClassVar[type[Strict]] = KerbOptions
     piece_schema: ClassVar[pa.Schema] = LINE_PIECES
+    reach_m: ClassVar[float] = REACH_M
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:
         """Returns parts of the scene's steps within its tile."""

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from roadscan.assets.edges.along_drive import BESIDE_PIECES, pieces_beside
 from roadscan.assets.edges.line_pieces import Strip, joined_lines, polygon_of, running_slope, sigma_width_m, strips_of
+from roadscan.assets.edges.profiles import REACH_M
 from roadscan.assets.green.edges import ended_at_green
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence
 from roadscan.assets.kinds.kerb import types_along
@@ -39,6 +40,7 @@ class Sidewalk(AssetKind):
     curve: ClassVar[str] = "products"
     options: ClassVar[type[Strict]] = SidewalkOptions
     piece_schema: ClassVar[pa.Schema] = BESIDE_PIECES
+    reach_m: ClassVar[float] = REACH_M
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:
         """Returns the scene's edges within its tile, and at each node the surface behind it."""

@@ -13,7 +13,7 @@ import shapely
 from scipy.spatial import cKDTree
 
 from roadscan.assets.edges.along_drive import tracks_of
-from roadscan.assets.edges.line_pieces import cut_at, joined_lines, pieces_table
+from roadscan.assets.edges.line_pieces import cut_at, joined_lines, node_names, pieces_table, ribbon
 from roadscan.assets.edges.steps import raster_of
 from roadscan.assets.kind import AssetObject
 from roadscan.assets.kinds.kerb import Kerb, KerbOptions
@@ -159,3 +159,24 @@ def test_a_line_with_a_node_on_a_border_is_one_line() -> None:
             tables.append(pieces_table(parts, scene, raster_of(scene), Kerb.piece_schema))
     (line,) = joined_lines(pa.concat_tables(tables))
     np.testing.assert_array_equal(line.nodes, nodes)
+
+
+def test_a_kerb_that_is_cut_at_its_corner_is_one() -> None:
+    """Pieces of 5 m that meet at a right angle on the border of two squares."""
+    schema, along = Kerb.piece_schema, np.arange(0.0, 5.1, 0.5)
+    rows = []
+    for x, y, cut in ((along, 0.0 * along, (False, True)), (5.0 + 0.0 * along, along, (True, False))):
+        nodes = {name: np.zeros(along.size) for name in node_names(schema)} | {"easting_m": x, "northing_m": y}
+        rows.append(nodes | {"returns": 9, "passes": [1], "first_epoch_gps_ns": 1, "last_epoch_gps_ns": 2,
+                             "cut_first": cut[0], "cut_last": cut[1]})  # fmt: skip
+    (line,) = joined_lines(pa.Table.from_pylist(rows, schema=schema))
+    assert np.ptp(line.nodes[:, 0]) == np.ptp(line.nodes[:, 1]) == 5.0
+
+
+def test_a_strip_around_a_roundabout_leaves_its_inside_free() -> None:
+    turn = np.linspace(0.0, 2.0 * np.pi, 81)
+    inner, outer = (np.column_stack([r * np.cos(turn), r * np.sin(turn), 0.0 * turn]) for r in (8.0, 10.0))
+    around = ribbon(inner, outer)
+    assert around is not None
+    assert around.area == pytest.approx(np.pi * (10.0**2 - 8.0**2), rel=0.02)
+    assert around.has_z

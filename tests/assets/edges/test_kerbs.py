@@ -188,29 +188,26 @@ def test_the_border_of_a_bed_of_plants_is_no_kerb() -> None:
     assert found and all(one.geometry.centroid.y < -4.5 for one in found)
 
 
-def test_a_bed_of_plants_ends_at_no_kerb_but_grass_may_grow_behind_one() -> None:
-    """A road 8 m wide: a kerb of 12 cm with grass behind it to the left, a bed of tufts to the right."""
+@pytest.mark.parametrize(
+    ("height_m", "grass_m", "passes_m"), [(0.12, 0.015, 0.0), (0.06, 0.06, 0.0), (0.08, 0.08, 0.0), (0.12, 0.0, 0.075)]
+)
+def test_kerbs_stay_with_grass_behind_them_and_where_passes_differ(
+    height_m: float, grass_m: float, passes_m: float
+) -> None:
+    """A road 8 m wide with a kerb to the left; a half of the returns is that of a pass that lies higher."""
     rng = np.random.default_rng(5)
-
-    def recess(x_m: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-        """How far the front lies behind the bed's edge: tufts of 0.4 m, side by side."""
-        return np.asarray(0.2 * np.abs(np.cos(np.pi * x_m / 0.4)))
-
     x, y = (a.ravel() for a in np.meshgrid(np.arange(0.0, 30.0, 0.05), np.arange(-8.0, 8.0, 0.05)))
     y = y + rng.uniform(-0.02, 0.02, y.size)
-    grass = np.where(y > 4.15, np.abs(rng.normal(0.0, 0.015, y.size)), 0.0)
-    bed = np.where(y < -4.0 - recess(x), 0.22 * rng.uniform(0.6, 1.0, y.size), 0.0)
-    z = np.where(y > 4.0, 0.12 + grass, bed)
+    z = np.where(y > 4.0, height_m + np.where(y > 4.15, np.abs(rng.normal(0.0, 1.0, y.size)) * grass_m, 0.0), 0.0)
     ahead = np.tile(np.arange(0.0, 30.0, 0.01), 3)
-    face = np.column_stack([ahead, np.full(ahead.size, 4.0), rng.uniform(0.0, 0.12, ahead.size)])
-    front = np.column_stack([ahead, -4.0 - recess(ahead), rng.uniform(0.0, 0.2, ahead.size)])
-    points = np.concatenate([np.column_stack([x, y, z]), face, front])
+    face = np.column_stack([ahead, np.full(ahead.size, 4.0), rng.uniform(0.0, height_m, ahead.size)])
+    points = np.concatenate([np.column_stack([x, y, z]), face])
     points[:, 1:] += rng.normal(0.0, 0.008, (len(points), 2))
+    points[::2, 2] += passes_m
     sensor = np.column_stack([points[:, 0], np.zeros(len(points)), np.full(len(points), 2.0)])
     returns = returns_of(points, np.full(len(points), 1000.0), np.arange(len(points)), sensor)
     drive = np.column_stack([np.arange(0.0, 30.0), np.zeros(30), np.full(30, 2.0), np.ones(30)])
     box = Box(0.0, -8.0, 30.0, 8.0)
     found = points_along(lines_of(kerbs_of(make_scene(returns, box, box, drive))))
     along = np.arange(1.0, 29.0, 0.1)
-    assert share_within(np.column_stack([along, np.full(along.size, 4.0)]), found, 0.05) >= 0.95
-    assert not (found[:, 1] < -3.5).any()
+    assert share_within(np.column_stack([along, np.full(along.size, 4.0)]), found, 0.1) >= 0.95

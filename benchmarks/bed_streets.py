@@ -14,11 +14,7 @@ from roadscan.simulate import Scene
 def town_with_beds(seed: int, length_m: float = 64.0) -> Scene:
     """A straight town street, driven once or twice: beds 0.15–0.6 m high behind both kerbs, trees, parked cars."""
     random = np.random.default_rng([seed, 101])
-
-    def between(low: float, high: float) -> float:
-        return float(random.uniform(low, high))
-
-    street = town()
+    between, street = random.uniform, town()
     beds = _beds(between, 5.6, (1.2, 3.0), (8.0, 14.0), (5.0, 14.0), (1.8, 4.0), (4.0, 10.0), (0.15, 0.6), length_m)
     road = street.road.model_dump() | {
         "alignment": [{"kind": "straight", "length_m": 300.0}], "lead_m": 60.0, "verge_slope": between(-0.03, 0.05),
@@ -56,11 +52,7 @@ def town_with_beds(seed: int, length_m: float = 64.0) -> Scene:
 def motorway_with_beds(seed: int, length_m: float = 80.0) -> Scene:
     """A straight motorway, driven in one or two lanes: beds 0.3–0.8 m high behind both guardrails, in their shade."""
     random = np.random.default_rng([seed, 102])
-
-    def between(low: float, high: float) -> float:
-        return float(random.uniform(low, high))
-
-    street = motorway()
+    between, street = random.uniform, motorway()
     beds = _beds(between, 9.4, (0.5, 1.2), (6.0, 12.0), (10.0, 30.0), (1.8, 3.5), (5.0, 15.0), (0.3, 0.8), length_m)
     road = street.road.model_dump() | {
         "alignment": [{"kind": "straight", "length_m": 300.0}], "cross_slopes": [], "joints": [], "cracks": [],

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Final
 
 import geopandas
-import laspy
 import numpy as np
 import numpy.typing as npt
 import shapely
@@ -20,8 +19,9 @@ import shapely
 from benchmarks.hard_streets import hard_street
 from benchmarks.judged_scenes import in_window
 from benchmarks.labelled_returns import labelled_returns
-from benchmarks.labelled_street import run
+from benchmarks.labelled_street import classified_points, run
 from benchmarks.settings import bench_folder
+from benchmarks.street_scores import ON_GROUND
 from benchmarks.timing import Figure
 from roadscan.assets import classes
 from roadscan.assets.scene import Returns
@@ -41,7 +41,6 @@ _LEAST: Final = 15  # Returns of a metre that is judged.
 _BESIDE_M, _BEFORE_M, _STEP_M = 0.35, 0.6, 0.5
 """A line is found that lies so far beside a place and so far before or beyond it; lines are points so far apart (m)."""
 _LOWEST_M: Final = 0.3  # Returns higher above the road's foot there (m) show a fence; walls are judged from 0.55 m on.
-_ON_GROUND: Final = (classes.GROUND, classes.ROAD, classes.KERB, classes.MARKING, classes.SIDEWALK, classes.LOW_NOISE)
 
 
 def figures(folder: Path) -> Iterator[Figure]:
@@ -117,11 +116,9 @@ def _places(store: Store, surface: Surface, name: str) -> Float64:
 
 def _standing(store: Store, surface: Surface) -> tuple[Float64, npt.NDArray[np.uint8]]:
     """Stations and offsets (2, n) of classified points that do not lie on the ground, and their classes."""
-    clouds = [laspy.read(path) for path in sorted(Path(store.path("products/classified_points")).glob("*.laz"))]
-    code = np.concatenate([np.asarray(one.classification) for one in clouds])
-    x, y = (np.concatenate([np.asarray(one[axis]) for one in clouds]) for axis in ("x", "y"))
-    stands = ~np.isin(code, _ON_GROUND)
-    return np.stack(surface.station_offset_m(x[stands], y[stands])), code[stands].astype(np.uint8)
+    points, code = classified_points(store)
+    stands = ~np.isin(code, (*ON_GROUND, classes.LOW_NOISE))
+    return np.stack(surface.station_offset_m(*points[stands, :2].T)), code[stands]
 
 
 def _near(places: Float64, station_m: float, offset_m: float) -> bool:

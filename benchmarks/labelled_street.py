@@ -159,10 +159,7 @@ def read_street(folder: Path) -> LabelledStreet:
     survey = Survey.load(folder / "SURVEY.toml")
     store = Store(survey.store_url, survey.config.id)
     places, labels = (np.concatenate(parts) for parts in zip(*labelled_sweeps(folder), strict=True))
-    clouds = sorted(Path(store.path("products/classified_points")).glob("*.laz"))
-    read = [laspy.read(cloud) for cloud in clouds]
-    points = np.concatenate([np.asarray(one.xyz) for one in read])
-    found = np.concatenate([np.asarray(one.classification) for one in read])
+    points, found = classified_points(store)
     away, nearest = cKDTree(places).query(points, distance_upper_bound=_SAME_M, workers=-1)
     own = np.where(np.isfinite(away), np.append(labels, np.uint8(0))[nearest], np.uint8(0)).astype(np.uint8)
     tables = {}
@@ -170,7 +167,14 @@ def read_street(folder: Path) -> LabelledStreet:
         file = Path(store.path(f"products/assets/{table}.parquet"))
         if file.is_file():
             tables[kind] = geopandas.read_parquet(file)
-    return LabelledStreet(folder, places, labels, points, found.astype(np.uint8), own, tables)
+    return LabelledStreet(folder, places, labels, points, found, own, tables)
+
+
+def classified_points(store: Store) -> tuple[Float64, npt.NDArray[np.uint8]]:
+    """Points (n, 3) of the classified clouds of a store, and their classes (n,)."""
+    read = [laspy.read(cloud) for cloud in sorted(Path(store.path("products/classified_points")).glob("*.laz"))]
+    classes = np.concatenate([np.asarray(one.classification, np.uint8) for one in read])
+    return np.concatenate([np.asarray(one.xyz) for one in read]), classes
 
 
 def labelled_sweeps(folder: Path) -> Iterator[tuple[Float64, npt.NDArray[np.uint8]]]:

@@ -23,6 +23,7 @@ from roadscan.assets.judgement.judge import Judge
 from roadscan.assets.kernels.columns import mark_corridor
 from roadscan.assets.scene import Scene, once_a_scene
 from roadscan.compute.array_types import Bool, Float64
+from roadscan.compute.arrays import runs_of
 from roadscan.core.extras import cv2
 
 
@@ -374,8 +375,12 @@ def free_parts(edge: Edge, taken: Bool) -> list[Edge]:
     free = means_about(taken.astype(np.float64), _FOOT_NODES) <= _MOST
     if free.all():
         return [edge]
-    number, count = scipy.ndimage.label(free)
-    runs = (np.flatnonzero(number == k) for k in range(1, count + 1))
+    return _parts(edge, free)
+
+
+def _parts(edge: Edge, chosen: Bool) -> list[Edge]:
+    """Returns the runs of an edge's chosen nodes (n,) that are long enough and of which one was seen."""
+    runs = (np.arange(first, end) for first, end in runs_of(chosen))
     return [edge.at(rows) for rows in runs if (len(rows) - 1) * NODE_M >= _SHORTEST_M and edge.seen[rows].any()]
 
 
@@ -418,10 +423,4 @@ def kerb_parts(edge: Edge, probability: Float64) -> list[Edge]:
     smooth = scipy.ndimage.uniform_filter1d(told, _SMOOTH_NODES, mode="nearest")
     good = np.pad(smooth >= LEAST, _HOLE_NODES)
     whole = scipy.ndimage.binary_closing(good, np.ones(_HOLE_NODES + 1))[_HOLE_NODES:-_HOLE_NODES]
-    number, count = scipy.ndimage.label(whole)
-    parts = []
-    for k in range(1, count + 1):
-        rows = np.flatnonzero(number == k)
-        if (len(rows) - 1) * NODE_M >= _SHORTEST_M and edge.seen[rows].any():
-            parts.append(edge._replace(probability=smooth).at(rows))
-    return parts
+    return _parts(edge._replace(probability=smooth), whole)

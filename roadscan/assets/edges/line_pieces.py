@@ -45,7 +45,6 @@ def line_schema(columns: Sequence[str]) -> pa.Schema:
 LINE_PIECES: Final = line_schema(NODE_COLUMNS)
 """Columns of a piece: a value a node in the direction of the line (higher side to the right), what saw it, and whether
 its ends lie on the tile's border. `seen` is 1 for nodes whose step was measured; `probability` is that of a kerb."""
-_SAME_M: Final = 0.001  # Ends so near to each other (m) are those of one cut.
 JOIN_M: Final = 0.5
 """Greatest distance (m) between the ends of two tiles' lines on their border."""
 SAME_M: Final = 1e-3
@@ -291,8 +290,12 @@ def _partners(lines: Sequence[Line], lasts: Sequence[int], firsts: Sequence[int]
 
 def _goes_on(a: Line, b: Line) -> bool:
     """Returns whether a line goes on in another: from the same place, whatever corner is there, or straight on."""
-    same = float(np.hypot(*(a.nodes[-1, :2] - b.nodes[0, :2]))) <= _SAME_M
-    return same or bool(_direction(a, -1) @ _direction(b, 0) > 0.7)
+    return _meet(a, b) or bool(_direction(a, -1) @ _direction(b, 0) > 0.7)
+
+
+def _meet(a: Line, b: Line) -> bool:
+    """Returns whether a line ends where the other begins."""
+    return float(np.hypot(*(a.nodes[-1, :2] - b.nodes[0, :2]))) <= SAME_M
 
 
 def _direction(line: Line, end: int) -> Float64:
@@ -323,7 +326,7 @@ def _cuts_a_segment(a: Line, b: Line) -> bool:
     if not 0.0 < length <= SEGMENT_M:
         return False
     aside = (np.stack([a.nodes[-1, :2], b.nodes[0, :2]]) - first) @ np.array([way[1], -way[0]]) / length
-    return bool(np.abs(aside).max() <= SAME_M and np.hypot(*(a.nodes[-1, :2] - b.nodes[0, :2])) <= SAME_M)
+    return bool(np.abs(aside).max() <= SAME_M) and _meet(a, b)
 
 
 MEDIAN_NODES: Final = 5

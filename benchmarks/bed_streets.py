@@ -49,6 +49,15 @@ def town_with_beds(seed: int, length_m: float = 64.0) -> Scene:
     )  # fmt: skip
 
 
+def town_partly_driven_twice(seed: int) -> Scene:
+    """The same town street, 150 m long and driven once, 44 m of it a second time; trajectories are 70 mm off (1 σ)."""
+    street = town_with_beds(seed)
+    again = {"station_m": 10.0, "offset_m": -1.6, "pieces": [{"length_m": 44.0}]}
+    passes: list[dict[str, Any]] = [{"lane": 2}, {"lane": 2, "route": again}]
+    noise = street.noise.model_dump() | {"pass_step_m": 0.07, "position_m": 0.0, "attitude_deg": 0.0}
+    return street.changed(id=f"beds-twice-{seed}", length_m=150.0, passes=passes, noise=noise)
+
+
 def motorway_with_beds(seed: int, length_m: float = 80.0) -> Scene:
     """A straight motorway, driven in one or two lanes: beds 0.3–0.8 m high behind both guardrails, in their shade."""
     random = np.random.default_rng([seed, 102])

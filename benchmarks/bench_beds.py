@@ -9,7 +9,7 @@ from typing import Final
 
 from benchmarks.asset_scores import area_figures, line_figures
 from benchmarks.asset_streets import processed, seen_by
-from benchmarks.bed_streets import motorway_with_beds, town_with_beds
+from benchmarks.bed_streets import motorway_with_beds, town_partly_driven_twice, town_with_beds
 from benchmarks.settings import bench_folder
 from benchmarks.timing import Figure
 
@@ -21,7 +21,11 @@ _SETTINGS: Final = "kinds = ['landscape_area', 'kerb']\nbare_earth = false\nexpo
 def figures(folder: Path) -> Iterator[Figure]:
     """Figures of each street and lidar."""
     for seed in SEEDS:
-        for name, scene in (("town", town_with_beds(seed)), ("motorway", motorway_with_beds(seed))):
+        for name, scene in (
+            ("town", town_with_beds(seed)),
+            ("motorway", motorway_with_beds(seed)),
+            ("town partly driven twice", town_partly_driven_twice(seed)),
+        ):
             for model in MODELS:
                 place = bench_folder(folder) / f"beds-{name}-{seed}-{model}"
                 street = processed(seen_by(model, scene), place, settings=_SETTINGS)

@@ -1,4 +1,4 @@
-"""Sorting of items by their bin."""
+"""Sorting of items by their bin, and sums over cells."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy.typing as npt
 
 from roadscan.assets.kernels.buckets import by_number, raster_cells
 from roadscan.assets.kernels.columns import distinct
-from roadscan.compute.array_types import Float64, Int64
+from roadscan.compute.array_types import Bool, Float64, Int64
+from roadscan.core.extras import cv2
 
 
 def in_bins(number: npt.NDArray[np.integer[Any]], bins: int) -> tuple[Int64, Int64]:
@@ -32,6 +33,12 @@ def cells_of(
     cell = np.empty(x_m.size, np.int32)
     raster_cells(x_m, y_m, grid, shape, cell)
     return cell
+
+
+def sums_around(cells: Float64 | Bool, size: int) -> Float64:
+    """Returns sums (rows, columns) over the squares of `size` by `size` cells about each cell; outside lies 0."""
+    values = np.asarray(cells, np.float64)
+    return np.asarray(cv2.boxFilter(values, -1, (size, size), normalize=False, borderType=cv2.BORDER_CONSTANT))
 
 
 def distinct_steps(epoch_gps_ns: Int64, step_ns: int) -> Int64:

@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
+from roadscan.assets.bins import sums_around
 from roadscan.assets.kernels.beams import log_gains, meet_ground
 from roadscan.assets.quantiles import median, quantiles, weighted_quantile
 from roadscan.assets.scene import GroundModel, Returns, Scene
@@ -305,24 +306,16 @@ def _slopes(ground: GroundModel) -> tuple[Float64, Float64]:
     """Slopes (rows, columns) to the east and to the north (m/m) of the least-squares plane through the cells around
     each cell in which ground was seen; 0 where there are none.
     """
-    from roadscan.core.extras import cv2
-
     known = ground.seen & np.isfinite(ground.height_m)
     weight = known.astype(np.float64)
     size = 2 * int(_SLOPE_OVER_M / ground.cell_m / 2) + 1
     level = float(np.mean(ground.height_m[known], dtype=np.float64)) if known.any() else 0.0
     z = np.where(known, ground.height_m.astype(np.float64) - level, 0.0)
     y, x = (ground.cell_m * (at - at.mean()) for at in np.indices(z.shape).astype(np.float64))
-
-    def total(value: Float64) -> Float64:
-        return np.asarray(
-            cv2.boxFilter(value, cv2.CV_64F, (size, size), None, (-1, -1), False, cv2.BORDER_CONSTANT), np.float64
-        )
-
-    number = np.maximum(total(weight), 1.0)
+    number = np.maximum(sums_around(weight, size), 1.0)
 
     def mean(value: Float64) -> Float64:
-        return total(weight * value) / number
+        return sums_around(weight * value, size) / number
 
     mx, my, mz = mean(x), mean(y), mean(z)
     xx, yy, xy = mean(x * x) - mx * mx + _EVEN_M2, mean(y * y) - my * my + _EVEN_M2, mean(x * y) - mx * my

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets import classes
+from roadscan.assets.bins import sums_around
 from roadscan.assets.ground.surface import Grid, grid_over
 from roadscan.assets.kernels import cubes
 from roadscan.assets.kernels import cubes as voxels
@@ -196,10 +197,7 @@ def leaves(cubes: Cubes, grid: Grid) -> Bool:
     number, scattering = np.zeros(grid.shape), np.zeros(grid.shape)
     np.add.at(number, (row, column), 1.0)
     np.add.at(scattering, (row, column), cubes.features[:, voxels.SCATTERING].astype(np.float64))
-    sums = [
-        cv2.boxFilter(a, cv2.CV_64F, (3, 3), None, (-1, -1), False, cv2.BORDER_CONSTANT) for a in (number, scattering)
-    ]
-    return np.asarray((sums[1] >= _LEAFY * sums[0])[row, column])
+    return np.asarray((sums_around(scattering, 3) >= _LEAFY * sums_around(number, 3))[row, column])
 
 
 def walls_and_roofs(cubes: Cubes, grid: Grid) -> tuple[Bool, Bool]:

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from benchmarks.asset_scores import calibration_error, figures_of
-from benchmarks.asset_streets import motorway, processed, town
+from benchmarks.asset_streets import motorway, processed, seen_by, town
+from benchmarks.bed_streets import town_partly_driven_twice
 from benchmarks.bench_asset_probability import HELD_OUT, judged_streets
 
 pytestmark = [pytest.mark.nightly, pytest.mark.timeout(3600)]
@@ -38,6 +39,15 @@ def test_a_whole_street(name: str, tmp_path: Path) -> None:
             missed[figure.what] = figure.value
     assert missed.keys() == MISSED[name].keys(), missed
     assert all(missed[what] >= least for what, least in MISSED[name].items()), missed
+
+
+@pytest.mark.parametrize("seed", [3, 7])
+def test_bare_ground_where_passes_differ_in_height_is_not_grown_over(seed: int, tmp_path: Path) -> None:
+    """Passes lie 56 and 84 mm apart; with these differences 33 m² of street 3 were landscape areas."""
+    street = town_partly_driven_twice(seed)
+    bare = street.changed(roadside=street.roadside.model_dump() | {"plantings": [], "trees": []})
+    settings = "kinds = ['landscape_area']\nbare_earth = false\nexports = []\n"
+    assert not len(processed(seen_by("VLP-16", bare), tmp_path, settings=settings).found("landscape_area"))
 
 
 def test_probabilities_of_drawn_streets_hold(tmp_path: Path) -> None:

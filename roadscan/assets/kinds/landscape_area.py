@@ -11,10 +11,11 @@ import shapely
 from pydantic import Field
 
 from roadscan.assets import classes
-from roadscan.assets.bins import cells_of, in_bins
+from roadscan.assets.bins import cells_of, in_bins, sums_around
 from roadscan.assets.green.colours import FINE, FINE_M
 from roadscan.assets.kernels.low_returns import low_moments
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence
+from roadscan.assets.pass_heights import heights_of_one_pass_m
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.panels import panels_of
 from roadscan.assets.upright.slices import touching
@@ -95,7 +96,8 @@ def grown_cells(scene: Scene, options: LandscapeOptions) -> pa.Table:
                   ((tile.y_min_m, tile.y_max_m), (tile.x_min_m, tile.x_max_m)))  # fmt: skip
     shape = (inner[0] + 2 * margin, inner[1] + 2 * margin)
     flat = _flat_ones(scene)
-    sums = _sums(scene, flat, corner, shape)
+    above = _heights_m(scene, flat, corner, shape)
+    sums = _sums(scene, above, flat, corner, shape)
     counted, rough = _roughness(sums)
     road = _cells_with(scene, classes.ROAD, corner, shape) & counted
     even = road_roughness_m(scene, rough, road)
@@ -106,10 +108,10 @@ def grown_cells(scene: Scene, options: LandscapeOptions) -> pa.Table:
     wall = cv2.dilate(wall, _POOLED, iterations=2) > 0
     is_rough = counted & (ratio >= options.rough_ratio) & ~wall
     wide = _wide_ones(is_rough, (counted & ~is_rough) | wall, counted)
-    off = np.abs(scene.above_ground_m) > options.rough_ratio * even
-    share = _sums(scene, flat, corner, shape, off.astype(np.float32))[..., 3]
+    off = np.abs(above) > options.rough_ratio * even
+    share = _sums(scene, above, flat, corner, shape, off.astype(np.float32))[..., 3]
     driven = (scene.classes == classes.ROAD).astype(np.float32)
-    every = _sums(scene, np.ones(flat.size, np.bool_), corner, shape, driven)
+    every = _sums(scene, above, np.ones(flat.size, np.bool_), corner, shape, driven)
     is_road = counted & (every[..., 3] >= _MOST * every[..., 0])
     grown = _up_to_edge(wide, is_rough, counted & ~is_rough & ~wall, sums[..., 0], share) & ~is_road
     unseen = sums[..., 0] == 0
@@ -125,20 +127,13 @@ def _closed(cells: Bool) -> Bool:
     return np.asarray(cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_CLOSE, _GAP) > 0)
 
 
-def _number_in(cells: Float64 | Bool, size: int) -> Float64:
-    """Returns sums (rows, columns) over squares of `size` cells of whole numbers, which any square adds up alike."""
-    return np.asarray(
-        cv2.boxFilter(cells.astype(np.float64), -1, (size, size), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    )
-
-
 def _wide_ones(rough: Bool, smooth: Bool, counted: Bool) -> Bool:
     """Returns cells (rows, columns) of rough ground that is wide.
 
     Cells that too few returns hit speak for neither side: those between rough ones belong to them.
     """
     size = _WIDE.shape[0]
-    fits = (_number_in(smooth, size) <= _SMOOTH) & (_number_in(rough, size) >= _SEEN_SHARE * size**2)
+    fits = (sums_around(smooth, size) <= _SMOOTH) & (sums_around(rough, size) >= _SEEN_SHARE * size**2)
     wide = (cv2.dilate(fits.view(np.uint8), _WIDE) > 0) & rough
     return np.asarray(_closed(wide) & (wide | ~counted))
 
@@ -150,14 +145,16 @@ def _up_to_edge(wide: Bool, rough: Bool, smooth: Bool, number: Float64, off: Flo
     area and on smooth ground beside it. Cells count alike: the front of a bed returns many more beams than the ground.
     """
     seen = number > 0
-    share = _number_in(np.rint(_WHOLE_SHARE * off / np.maximum(number, 1.0)), 3) / np.maximum(_number_in(seen, 3), 1.0)
+    share = sums_around(np.rint(_WHOLE_SHARE * off / np.maximum(number, 1.0)), 3) / np.maximum(
+        sums_around(seen, 3), 1.0
+    )
     share = np.rint(share)
     within = (cv2.erode(wide.view(np.uint8), _CORE) > 0) & (rough | smooth)
     beside = smooth & ~(cv2.dilate(wide.view(np.uint8), _POOLED) > 0)
     levels, known = [], []
     for cells in (within, beside):
-        known.append(_number_in(cells, _LEVELS))
-        levels.append(_number_in(np.where(cells, share, 0.0), _LEVELS) / np.maximum(known[-1], 1.0))
+        known.append(sums_around(cells, _LEVELS))
+        levels.append(sums_around(np.where(cells, share, 0.0), _LEVELS) / np.maximum(known[-1], 1.0))
     return np.asarray(wide & seen & ((share >= 0.5 * (levels[0] + levels[1])) | (known[0] == 0.0)))
 
 
@@ -167,7 +164,9 @@ def _without_thin_rim(grown: Bool, number: Float64) -> Bool:
     Behind the top of plants or a rail a beam whose halves meet both returns from a place between them, on nothing.
     """
     for _ in range(_RIM):
-        around = _number_in(np.where(grown, number, 0.0), _RIM_LEVELS) / np.maximum(_number_in(grown, _RIM_LEVELS), 1.0)
+        around = sums_around(np.where(grown, number, 0.0), _RIM_LEVELS) / np.maximum(
+            sums_around(grown, _RIM_LEVELS), 1.0
+        )
         rim = grown & ~(cv2.erode(grown.view(np.uint8), _CROSS, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0)
         grown = grown & ~(rim & (number < _THIN * around))
     return grown
@@ -178,7 +177,8 @@ def roughness_of_road_m(scene: Scene) -> float | None:
     box = scene.extent
     corner = np.array([box.x_min_m, box.y_min_m])
     shape = round((box.y_max_m - box.y_min_m) / CELL_M), round((box.x_max_m - box.x_min_m) / CELL_M)
-    counted, rough = _roughness(_sums(scene, _low_ones(scene), corner, shape))
+    low = _low_ones(scene)
+    counted, rough = _roughness(_sums(scene, _heights_m(scene, low, corner, shape), low, corner, shape))
     return road_roughness_m(scene, rough, _cells_with(scene, classes.ROAD, corner, shape) & counted)
 
 
@@ -189,8 +189,7 @@ def road_roughness_m(scene: Scene, rough_m: Float64, road: Bool) -> float | None
 
 def _roughness(sums: Float64) -> tuple[Bool, Float64]:
     """Returns which cells (rows, columns) have enough returns around them, and how these scatter (m)."""
-    pooled = [cv2.boxFilter(s, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
-              for s in np.moveaxis(sums[..., :3], -1, 0)]  # fmt: skip
+    pooled = [sums_around(sums[..., k], 3) for k in range(3)]
     n = np.maximum(pooled[0], 1.0)
     return pooled[0] >= _LEAST_RETURNS, np.sqrt(np.maximum(pooled[2] / n - (pooled[1] / n) ** 2, 1e-8))
 
@@ -211,15 +210,24 @@ def _flat_ones(scene: Scene) -> Bool:
     return counted
 
 
+def _heights_m(scene: Scene, counted: Bool, corner: Float64, shape: tuple[int, int]) -> Float32:
+    """Returns heights above the ground (n,) (m), without what passes differ: plants scatter within a pass."""
+    return heights_of_one_pass_m(scene, counted, np.array(_LOW_M), corner, CELL_M, shape)
+
+
 def _sums(
-    scene: Scene, counted: Bool, corner: Float64, shape: tuple[int, int], values: Float32 | None = None
+    scene: Scene,
+    above_m: Float32,
+    counted: Bool,
+    corner: Float64,
+    shape: tuple[int, int],
+    values: Float32 | None = None,
 ) -> Float64:
     """Returns sums (rows, columns, 4) over the low returns of cells that count: n, Σh, Σh², and Σ of values (n,)."""
     returns = scene.returns
     sums = np.zeros((*shape, 4))
-    limits = np.array(_LOW_M)
     values = returns.intensity if values is None else values
-    low_moments(returns.x_m, returns.y_m, scene.above_ground_m, values, counted, limits, corner, CELL_M, sums)
+    low_moments(returns.x_m, returns.y_m, above_m, values, counted, np.array(_LOW_M), corner, CELL_M, sums)
     return sums
 
 
@@ -382,7 +390,7 @@ class LandscapeArea(AssetKind):
     options = LandscapeOptions
     piece_schema = PIECE_SCHEMA
     sees_green = True
-    reach_m = 9.0
+    reach_m = 11.0
 
     def evidence(self, scene: Scene, options: LandscapeOptions) -> Evidence:
         """Returns cells of the tile."""

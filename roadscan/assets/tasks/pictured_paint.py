@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 import shapely
 
+from roadscan.assets.bins import sums_around
 from roadscan.assets.green.areas import in_raster
 from roadscan.assets.green.cells import CELL_M
 from roadscan.assets.green.colours import FINE, FINE_M, Ground
@@ -155,8 +156,7 @@ def _fine_heights(window: Window) -> Float64:
 
 def _around(values: Float64) -> Float64:
     """Returns sums of values (rows, columns) over the square of 4 m around each fine cell."""
-    size = 2 * round(_NOISE_M / FINE_M / 2) + 1
-    return np.asarray(cv2.boxFilter(values, -1, (size, size), normalize=False, borderType=cv2.BORDER_CONSTANT))
+    return sums_around(values, 2 * round(_NOISE_M / FINE_M / 2) + 1)
 
 
 def noise_of(mean: Float64, known: Bool) -> Float64:

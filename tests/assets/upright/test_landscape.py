@@ -11,9 +11,9 @@ import pytest
 import shapely
 
 from roadscan.assets.kind import AssetObject
-from roadscan.assets.kinds.landscape_area import LandscapeArea
+from roadscan.assets.kinds.landscape_area import LandscapeArea, roughness_of_road_m
 from roadscan.assets.make_scene import make_scene
-from roadscan.assets.scene import Box, Scene
+from roadscan.assets.scene import Box, Scene, Statistics
 from tests.assets.edges.streets import returns_of
 
 BED = shapely.box(6.0, 5.0, 14.0, 8.0)
@@ -21,11 +21,12 @@ KIND = LandscapeArea()
 
 
 @functools.cache
-def street(every_m: float = 0.05, shade_m: float = 0.0) -> Scene:
+def street(every_m: float = 0.05, shade_m: float = 0.0, apart_m: float = 0.0) -> Scene:
     """A road of 16 m width seen with 5 mm of noise; on its side a bed 0.1–0.3 m high, and a rail above it.
 
     every_m : from ring to ring, which lie along the road; a ring has a return each 5 cm. shade_m : so far behind the
-    bed no return reaches the ground; one in ten is a mixture of the bed's top and of the ground behind.
+    bed no return reaches the ground; one in ten is a mixture of the bed's top and of the ground behind. apart_m : a
+    second pass sees all beyond 4 m along the road so much higher.
     """
     rng = np.random.default_rng(3)
     x, y = (a.ravel() for a in np.meshgrid(np.arange(0.0, 20.0, 0.05), np.arange(-10.0, 10.0, every_m)))
@@ -39,8 +40,10 @@ def street(every_m: float = 0.05, shade_m: float = 0.0) -> Scene:
     z += np.where(shaded, rng.uniform(0.0, 0.2, x.size) * (1.0 - behind / max(shade_m, 0.1)), 0.0)
     rail = np.column_stack([np.arange(0.0, 20.0, 0.01), np.full(2000, -6.0), 99.9 + rng.uniform(0.0, 0.7, 2000)])
     points = np.concatenate([np.column_stack([x, y, z]), rail])
+    second = (points[:, 0] > 4.0) & (rng.random(len(points)) < 0.5) & (apart_m > 0.0)
+    points[second, 2] += apart_m
     sensor = np.column_stack([points[:, 0], np.full(len(points), -2.0), np.full(len(points), 102.0)])
-    returns = returns_of(points, np.full(len(points), 1000.0), np.arange(len(points)), sensor)
+    returns = returns_of(points, np.full(len(points), 1000.0), np.arange(len(points)), sensor, 1.0 + second)
     drive = np.column_stack([np.arange(0.0, 20.0), np.full(20, -2.0), np.full(20, 102.0), np.ones(20)])
     box = Box(0.0, -10.0, 20.0, 10.0)
     return make_scene(returns, box, box, drive)
@@ -85,3 +88,17 @@ def test_mixed_returns_behind_a_bed_are_none_of_it() -> None:
     both = shapely.force_2d(one.geometry).intersection(BED).area
     assert both / BED.area >= 0.90
     assert both / one.geometry.area >= 0.95
+
+
+@pytest.mark.parametrize("every_m", [0.05, 0.2, 0.6])
+@pytest.mark.parametrize("apart_m", [0.03, 0.06, 0.075])
+def test_ground_that_two_passes_see_at_different_heights_is_not_grown_over(every_m: float, apart_m: float) -> None:
+    # Most of the survey was driven once, and tells how rough its road is.
+    rough = roughness_of_road_m(street(every_m))
+    assert rough is not None
+    scene = replace(street(every_m, apart_m=apart_m), statistics=Statistics({"road_roughness_m": rough}))
+    (one,) = areas(KIND.evidence(scene, KIND.options()).pieces)
+    both = shapely.force_2d(one.geometry).intersection(BED).area
+    # Each long side lies somewhere between two rings.
+    assert both / BED.area >= 0.97 - every_m / (BED.bounds[3] - BED.bounds[1])
+    assert both / one.geometry.area >= 0.95 - 0.5 * every_m / (BED.bounds[3] - BED.bounds[1])

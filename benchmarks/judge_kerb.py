@@ -17,7 +17,8 @@ UNKNOWN: Final = ("crossing", "outward")
 """Features that a cloud without drives and places of its sensor does not tell."""
 FIT: Final = {
     "min_data_in_leaf": 40, "num_leaves": 6, "rounds": 100,
-    "increasing": ("seen_low", "covered", "significance", "length_m", "evidence", "crossing"),
+    "increasing": ("seen_low", "covered", "significance", "length_m", "evidence", "crossing",
+                   "within_rings"),
     "decreasing": ("stands_high", "stands_low", "grows_low"),
 }  # fmt: skip
 

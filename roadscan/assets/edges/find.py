@@ -18,6 +18,7 @@ import scipy.spatial
 from roadscan.assets import classes
 from roadscan.assets.edges import profiles
 from roadscan.assets.edges.profiles import NODE_M, Heights, Nodes, paths_of
+from roadscan.assets.edges.rings import share_within_rings
 from roadscan.assets.edges.steps import HeightRaster, raster_of, step_places
 from roadscan.assets.judgement.judge import Judge
 from roadscan.assets.kernels.columns import mark_corridor
@@ -244,11 +245,14 @@ def node_features(scene: Scene, edges: Sequence[Edge]) -> dict[str, Float64]:
     nodes = [edge.nodes for edge in edges]
     names = ("x_m", "y_m", "heading_x", "heading_y", "step_m", "sigma_step_m", "seen_low", "covered")
     x, y, ux, uy, step, sigma, seen_low, covered = (np.concatenate([getattr(n, k) for n in nodes]) for k in names)
-    place = np.column_stack([x, y, ux, uy])
+    place, seen = np.column_stack([x, y, ux, uy]), np.concatenate([edge.seen for edge in edges])
+    raster = raster_of(scene)
+    near = np.flatnonzero(raster.used & _near(place, raster)[np.maximum(raster.cell, 0)])
     measured = {
         "seen_low": seen_low, "covered": covered,
         "significance": np.minimum(step / np.hypot(sigma, _LEAST_SIGMA_M), _MOST_RATIO),
         "outward": _outward(scene, place), **_of_returns(scene, place),
+        "within_rings": share_within_rings(scene.returns, near, place, np.where(seen, step, np.nan)),
     }  # fmt: skip
     ends = np.cumsum([len(n.x_m) for n in nodes])
     rows = [slice(end - len(n.x_m), end) for end, n in zip(ends, nodes, strict=True)]
@@ -330,6 +334,8 @@ KERB: Final = Judge("kerb", "cdef227f1ee2f1fc")
 """Whether a node of an edge lies at a kerb."""
 LEAST: Final = 0.5
 """An edge is cut where it is less probable (smoothed) that it is a kerb."""
+_LEAST_WITHIN_RINGS: Final = 0.2
+"""There is no kerb where single rings show less than this share of a step."""
 _SMOOTH_NODES: Final = 7  # Probabilities are means over this many nodes (3 m).
 _HOLE_NODES: Final = 4  # A shorter run of doubtful nodes (2 m) does not cut an edge.
 _SHORTEST_M: Final = 1.5  # Shorter parts are left out (m).
@@ -352,7 +358,8 @@ def free_edges(scene: Scene) -> list[Edge]:
     edges = open_edges(scene)
     if not edges:
         return []
-    stated = KERB.probability(node_features(scene, edges))
+    features = node_features(scene, edges)
+    stated = np.where(features["within_rings"] < _LEAST_WITHIN_RINGS, 0.0, KERB.probability(features))
     ends = np.cumsum([len(edge.seen) for edge in edges])
     return [part for edge, end in zip(edges, ends, strict=True)
             for part in kerb_parts(edge, stated[end - len(edge.seen) : end])]  # fmt: skip
@@ -416,11 +423,19 @@ def _standing(scene: Scene) -> Bool:
 def kerb_parts(edge: Edge, probability: Float64) -> list[Edge]:
     """Returns the runs of an edge's nodes that are more probably a kerb than not; probability : (n,) of each node.
 
-    Nodes whose step is hidden are as probable as the seen ones around them.
+    Nodes whose step is hidden are as probable as the seen ones around them. Where both sides are seen without a step
+    there is no kerb.
     """
     at = np.arange(len(probability))
     told = np.interp(at, at[edge.seen], probability[edge.seen])
+    told[~edge.seen & _both_sides_seen(edge.nodes)] = 0.0
     smooth = scipy.ndimage.uniform_filter1d(told, _SMOOTH_NODES, mode="nearest")
     good = np.pad(smooth >= LEAST, _HOLE_NODES)
     whole = scipy.ndimage.binary_closing(good, np.ones(_HOLE_NODES + 1))[_HOLE_NODES:-_HOLE_NODES]
     return _parts(edge._replace(probability=smooth), whole)
+
+
+def _both_sides_seen(nodes: Nodes, settings: EdgeSettings = DEFAULT) -> Bool:
+    """Returns a mask (n,) of nodes at which a step would be measured if there were one."""
+    seen = np.isfinite(nodes.sigma_step_m) & (nodes.covered >= settings.covered)
+    return seen & (nodes.seen_low >= settings.seen_low) & (nodes.seen_high_m >= settings.seen_high_m)

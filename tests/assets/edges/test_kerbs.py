@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +13,9 @@ from scipy.spatial import cKDTree
 
 from benchmarks.street_scores import points_along, share_within
 from roadscan.assets import classes
-from roadscan.assets.edges.find import edges_of_raster
-from roadscan.assets.edges.profiles import even_nodes
+from roadscan.assets.edges.find import Edge, edges_of_raster, kerb_parts
+from roadscan.assets.edges.profiles import Nodes, even_nodes
+from roadscan.assets.edges.rings import share_within_rings
 from roadscan.assets.edges.steps import of_cells
 from roadscan.assets.kind import AssetObject
 from roadscan.assets.kinds.kerb import Kerb, KerbOptions
@@ -211,3 +213,53 @@ def test_kerbs_stay_with_grass_behind_them_and_where_passes_differ(
     found = points_along(lines_of(kerbs_of(make_scene(returns, box, box, drive))))
     along = np.arange(1.0, 29.0, 0.1)
     assert share_within(np.column_stack([along, np.full(along.size, 4.0)]), found, 0.1) >= 0.95
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_an_edge_goes_on_where_its_step_is_hidden_and_not_where_both_sides_are_seen_without_one(hidden: bool) -> None:
+    along, flat = 0.5 * np.arange(40.0), np.zeros(40)
+    seen = (along < 9.0) | (along >= 11.0)
+    one, step = np.ones(40), np.where(seen, 0.1, 0.01)
+    sigma = np.where(seen | np.bool_(not hidden), 0.005, np.nan)
+    nodes = Nodes(along, flat, flat, one, flat, step, sigma, flat, flat, one, one, one, flat, one)
+    parts = kerb_parts(Edge(nodes, seen, one), np.where(seen, 0.8, 0.1))
+    assert [float(np.ptp(part.nodes.x_m)) for part in parts] == ([19.5] if hidden else [8.0, 8.0])
+
+
+def test_a_step_between_rings_is_no_kerb() -> None:
+    """Rings cross y = 4 at 20°; those seen mostly beyond it are stated 12 cm too high. A kerb of 12 cm at y = -4."""
+    rng = np.random.default_rng(3)
+    off, way = (a.ravel() for a in np.meshgrid(np.arange(-60.0, 30.0, 0.12), np.arange(0.0, 30.0, 0.08), indexing="ij"))
+    ring = np.repeat(np.arange(750), 375)
+    x, y, high = off + way * np.cos(np.radians(20.0)), -2.0 + way * np.sin(np.radians(20.0)), ring % 2 == 1
+    rows = np.flatnonzero((x > 0.0) & (x < 30.0) & (y < 8.0) & np.where(high, y > 3.9, y < 4.1))
+    beside = np.column_stack([rng.uniform(0.0, 30.0, 70_000), rng.uniform(-8.0, -2.0, 70_000), np.zeros(70_000)])
+    beside[:, 2] = np.where(beside[:, 1] < -4.0, 0.12, 0.0)
+    points = np.concatenate([np.column_stack([x, y, 0.12 * high])[rows], beside])
+    points[:, 2] += rng.normal(0.0, 0.006, len(points))
+    number = np.concatenate([ring[rows], np.full(len(beside), 1000)])
+    sensor = np.column_stack(
+        [points[:, 0] + 3.0, points[:, 1] - 8.0 * np.sign(points[:, 1]), np.full(len(points), 2.0)]
+    )
+    returns = returns_of(points, np.full(len(points), 1000.0), number // 64 * 100_000_000, sensor)
+    returns = replace(returns, laser=(number % 64).astype(np.uint16))
+    drive = np.column_stack([np.arange(0.0, 30.0), np.zeros(30), np.full(30, 2.0), np.ones(30)])
+    box = Box(0.0, -8.0, 30.0, 8.0)
+    found = kerbs_of(make_scene(returns, box, box, drive))
+    assert found and all(one.geometry.centroid.y < -3.5 for one in found)
+    assert sum(one.geometry.length for one in found) >= 28.0
+
+
+@pytest.mark.parametrize("slope", [-0.06, 0.0, 0.06])
+def test_rings_that_cross_an_edge_show_its_step_however_its_sides_slope(slope: float) -> None:
+    rng = np.random.default_rng(4)
+    across = np.tile(np.arange(-1.0, 1.0, 0.04), 100)
+    ring = np.repeat(np.arange(100), 50)
+    height = 0.03 * (across > 0.0) + slope * across + rng.normal(0.0, 0.004, across.size)
+    points = np.column_stack([0.1 * ring, -across, height + rng.normal(0.0, 0.03, 100)[ring]])
+    returns = returns_of(points, np.ones(len(points)), 100_000_000 * ring, points)
+    place = np.column_stack([np.arange(1.0, 9.0, 0.5), np.zeros(16), np.ones(16), np.zeros(16)])
+    share = share_within_rings(returns, np.arange(len(points)), place, np.full(16, 0.03))
+    assert share.min() > 0.6 and share.max() < 1.4
+    low = np.flatnonzero(across < 0.0)
+    assert np.isnan(share_within_rings(returns, low, place, np.full(16, 0.03))).all()

@@ -19,7 +19,7 @@ from roadscan.assets import classes
 from roadscan.assets.edges import profiles
 from roadscan.assets.edges.profiles import NODE_M, Heights, Nodes, paths_of
 from roadscan.assets.edges.rings import share_within_rings
-from roadscan.assets.edges.steps import HeightRaster, raster_of, step_places
+from roadscan.assets.edges.steps import LEAST_STEP_M, HeightRaster, raster_of, step_places
 from roadscan.assets.judgement.judge import Judge
 from roadscan.assets.kernels.columns import mark_corridor
 from roadscan.assets.scene import Scene, once_a_scene
@@ -31,7 +31,7 @@ from roadscan.core.extras import cv2
 class EdgeSettings(NamedTuple):
     """What makes a path of steps an edge. One setting for all data; a judge tells which edges are kerbs."""
 
-    least_step_m: float = 0.015
+    least_step_m: float = LEAST_STEP_M
     greatest_step_m: float = 0.28
     """Higher steps are walls."""
     seen_low: float = 0.6
@@ -98,7 +98,7 @@ def found_edges(raster: HeightRaster, heights: Heights, settings: EdgeSettings =
     parts: list[Edge] = []
     for chain in paths_of(step_places(raster)):
         line = profiles.chain_line(chain)
-        nodes = profiles.nodes_of(line, heights, raster, slopes)
+        nodes = profiles.nodes_of(line, heights, raster, slopes, profiles.near_places(line, chain))
         parts += _measured_runs(nodes, profiles.evidence_at(line, chain), settings)
     return _bridged(parts, heights, raster, slopes, settings)
 

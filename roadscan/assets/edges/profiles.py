@@ -13,7 +13,7 @@ import scipy.ndimage
 import scipy.spatial
 
 from roadscan.assets.bins import cells_of, in_bins
-from roadscan.assets.edges.steps import HeightRaster, Places
+from roadscan.assets.edges.steps import LEAST_STEP_M, HeightRaster, Places
 from roadscan.assets.kernels import step_profiles as kernel
 from roadscan.assets.kernels.edge_links import MAX_LINKS, best_ways, find_links, trace
 from roadscan.compute.array_types import Bool, Float64, Int64
@@ -215,16 +215,26 @@ def evidence_at(line: Float64, chain: Chain) -> Float64:
     return np.diff(np.concatenate([total[:1], middles, total[-1:]]))
 
 
-def nodes_of(line: Float64, heights: Heights, raster: HeightRaster, slopes: tuple[Float64, Float64]) -> Nodes:
+def near_places(line: Float64, chain: Chain) -> Bool:
+    """Returns a mask of the points (n, 2) along a chain that lie at one of its places, not in a gap between two."""
+    places = np.column_stack(chain.places[:2])
+    return np.asarray(scipy.spatial.cKDTree(places).query(line)[0] <= FREE_M)
+
+
+def nodes_of(
+    line: Float64, heights: Heights, raster: HeightRaster, slopes: tuple[Float64, Float64], shown: Bool | None = None
+) -> Nodes:
     """Returns nodes of a line (k, 2), each with the step that its surroundings show; the higher side is the right one.
 
     The line is moved to the steps and smoothed twice, since steps are measured best where it runs along the edge.
-    slopes : of the ground at large, see :meth:`HeightRaster.slopes`.
+    slopes : of the ground at large, see :meth:`HeightRaster.slopes`. shown : (k,) points that may show the edge; the
+    others, and those without a step, hardly bend the line: a chain may leave the edge where the edge is hidden.
     """
+    shown = np.ones(len(line), np.bool_) if shown is None else shown
     for _ in range(ROUNDS):
         ux, uy = headings(line[:, 0], line[:, 1])
         out, level = _fitted(line, (ux, uy), heights, raster, slopes)
-        known = np.isfinite(out[:, kernel.SIGMA_STEP])
+        known = shown & np.isfinite(out[:, kernel.SIGMA_STEP]) & (out[:, kernel.STEP] >= LEAST_STEP_M)
         offset = smooth_offsets(out[:, kernel.OFFSET] - 0.5 * out[:, kernel.FACE], known)
         moved = np.column_stack([line[:, 0] + offset * uy, line[:, 1] - offset * ux])
         line = smooth_line(moved, np.where(known, out[:, kernel.COVERED] + 0.05, 0.02))

@@ -54,6 +54,7 @@ UNEVENNESS_M: Final = 0.004
 """Standard deviation of a cell's true height about a smooth surface (m), whatever the number of returns."""
 _SEVERAL: Final = 4
 """Least number of heights of a cell for their scatter."""
+LEAST_STEP_M: Final = 0.015  # Lower steps are none (m).
 COARSE_M: Final = 1.5
 """Standard deviation of the window from which the slope of the ground at large is computed (m)."""
 NOT_GROUND: Final = (
@@ -200,7 +201,7 @@ class StepSettings(NamedTuple):
     """Width of the surroundings whose steps of the same direction show the scatter beyond that of the lines."""
     least_evidence: float = 2.0
     """Least significance (step over its σ) of a place."""
-    least_m: float = 0.015
+    least_m: float = LEAST_STEP_M
     greatest_m: float = 0.32
 
 

@@ -13,10 +13,11 @@ from scipy.spatial import cKDTree
 
 from benchmarks.street_scores import points_along, share_within
 from roadscan.assets import classes
+from roadscan.assets.edges import find
 from roadscan.assets.edges.find import Edge, edges_of_raster, kerb_parts
-from roadscan.assets.edges.profiles import Nodes, even_nodes
+from roadscan.assets.edges.profiles import Chain, Nodes, even_nodes
 from roadscan.assets.edges.rings import share_within_rings
-from roadscan.assets.edges.steps import of_cells
+from roadscan.assets.edges.steps import Places, of_cells
 from roadscan.assets.kind import AssetObject
 from roadscan.assets.kinds.kerb import Kerb, KerbOptions
 from roadscan.assets.make_scene import make_scene
@@ -157,6 +158,32 @@ def test_cells_alone_are_enough(street: SimulatedStreet) -> None:
         assert share_within(truth_line(street, side, FACE_OFFSET_M, np.arange(4.0, 24.0, 0.1)), found, 0.05) >= 0.97
     _, offset = street.surface.station_offset_m(found[:, 0] + street.corner_m[0], found[:, 1] + street.corner_m[1])
     assert np.mean(np.abs(np.abs(offset) - FACE_OFFSET_M) <= 0.05) >= 0.98
+
+
+@pytest.mark.parametrize("away_m", [0.5, 0.8])
+def test_a_path_that_leaves_a_hidden_kerb_does_not_bend_it(monkeypatch: pytest.MonkeyPatch, away_m: float) -> None:
+    """A kerb of 12 cm at y = 0 behind two cars, 2 m of it seen between them; chance places on flat ground behind."""
+    x, y = np.meshgrid(np.arange(0.05, 26.0, 0.1), np.arange(-3.95, 4.0, 0.1))
+    seen = (x < 8.0) | ((x > 11.5) & (x < 13.5)) | (x > 18.0) | (y > 0.25)
+    height = np.where(y > 0.0, 0.12, 0.0) + np.random.default_rng(3).normal(0.0, 0.003, x.shape)
+    count = np.where(seen, 5, 0).astype(np.int32)
+    raster = of_cells(0.0, -4.0, 0.1, count, np.where(seen, height, 0.0), np.full(x.shape, 0.003))
+    parts = [
+        np.arange(0.2, 8.0, 0.25),
+        [9.2, 10.4],
+        np.arange(11.6, 13.5, 0.25),
+        [14.8, 16.4],
+        np.arange(18.1, 25.8, 0.25),
+    ]
+    at = np.concatenate(parts)
+    off = np.repeat([0.0, away_m, 0.0, away_m, 0.0], [len(part) for part in parts])
+    flat = np.zeros(at.size)
+    places = Places(at, off, flat - 1.0, flat, flat + 8.0, flat + 0.12).at(np.arange(at.size)[::-1])
+    monkeypatch.setattr(find, "paths_of", lambda _: [Chain(places, np.full(at.size - 1, 1.0))])
+    edges = edges_of_raster(raster)
+    middle, length = np.abs(np.concatenate([edge.nodes.y_m for edge in edges])), sum(len(edge.seen) for edge in edges)
+    assert length >= 2 * 25
+    assert middle.max() <= 0.03
 
 
 def test_the_foot_of_a_fence_is_no_kerb() -> None:

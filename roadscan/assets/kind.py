@@ -123,6 +123,10 @@ class AssetKind(ABC):
         `pieces` come in the order of tiles (row, column); `others` holds the objects of the kinds named by `after`.
         """
 
+    def joined(self, pieces: pa.Table) -> pa.Table:
+        """Returns what the pieces of all tiles tell only together, for the methods below; its schema may be another."""
+        return pieces
+
     def with_pictures(self, pieces: pa.Table, shown: pa.Table) -> pa.Table:
         """Returns pieces with what green cells (`roadscan.assets.green.areas.GREEN_CELLS`) or paint of pictures
         (`roadscan.assets.tasks.pictured_paint.PAINTED`) say.

@@ -106,31 +106,6 @@ def moved_cells(spacing_m: float, settings: AcrossSettings = DEFAULT) -> int:
     return max(round(settings.move_m / spacing_m), 1)
 
 
-def edge_along(
-    height_m: Float64,
-    sigma_m: Float64,
-    spacing_m: tuple[float, float],
-    known_edge: Float64 | None = None,
-    settings: AcrossSettings = DEFAULT,
-    within_m: float | None = None,
-) -> EdgePath:
-    """Return the edge of a road on one side.
-
-    Parameters
-    ----------
-    height_m : (stations, offsets) heights from the middle of the road outward (m), NaN where none is known.
-    sigma_m : (stations, offsets) their standard deviations (m).
-    spacing_m : of stations and of offsets.
-    known_edge : (stations, offsets) evidence (σ) of other kinds, such as that of a kerb or a barrier.
-    within_m : as :func:`path_along` has it.
-    """
-    step, bend = evidence_across(height_m, sigma_m, spacing_m, settings)
-    found = counted(np.fmax(np.abs(step), np.abs(bend)), settings)
-    if known_edge is not None:
-        found = np.maximum(found, known_edge)
-    return path_along(found, spacing_m, settings, within_m)
-
-
 LINE_M: Final = 0.6
 """Painted lines are narrower than this."""
 PAINT: Final = 0.25

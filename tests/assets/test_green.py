@@ -9,7 +9,7 @@ import pyarrow as pa
 import pytest
 import shapely
 
-from roadscan.assets.edges.along_drive import BESIDE_PIECES
+from roadscan.assets.edges.beside import BESIDE_PIECES
 from roadscan.assets.green import colours
 from roadscan.assets.green.areas import GREEN_CELLS, Sums, green_rows, mosaic_of
 from roadscan.assets.green.cells import CELL_M, ground_cells

@@ -147,7 +147,7 @@ def returns_edge(easting_m: float, **values: float) -> dict:
     ],
 )
 def test_of_two_edges_on_one_side_one_stays(edge: dict, types: set[str]) -> None:
-    pieces = pa.Table.from_pylist([edge], schema=RoadEdge.piece_schema)
+    pieces = pa.Table.from_pylist([edge], schema=GREY_EDGES)
     settled = with_pictured(pieces, whole_edge())
     lines = joined_lines(settled)
     at = np.concatenate([line.column("northing_m") for line in lines])
@@ -187,13 +187,13 @@ AHEAD = np.arange(0.0, 30.1, 0.5)
     ],
 )
 def test_edges_of_other_roads_stay(returns: np.ndarray, pictured: np.ndarray, right: bool, by: dict) -> None:
-    pieces = pa.Table.from_pylist([edge_along(returns, right, **by)], schema=RoadEdge.piece_schema)
+    pieces = pa.Table.from_pylist([edge_along(returns, right, **by)], schema=GREY_EDGES)
     edges = pa.Table.from_pylist([edge_along(pictured, right, by_surface=1.0, sigma_m=0.05)], schema=GREY_EDGES)
     assert [len(row["easting_m"]) for row in with_pictured(pieces, edges).to_pylist()] == [AHEAD.size] * 2
 
 
 def test_without_edges_in_pictures_pieces_stay_the_same() -> None:
-    pieces = pa.Table.from_pylist([returns_edge(12.0)], schema=RoadEdge.piece_schema)
+    pieces = pa.Table.from_pylist([returns_edge(12.0)], schema=GREY_EDGES)
     assert with_pictured(pieces, GREY_EDGES.empty_table()) is pieces
 
 

@@ -17,14 +17,13 @@ import scipy.spatial
 
 from roadscan.assets import classes
 from roadscan.assets.edges import profiles
-from roadscan.assets.edges.profiles import NODE_M, Heights, Nodes, paths_of
+from roadscan.assets.edges.profiles import NODE_M, Heights, Nodes, paths_of, runs_along
 from roadscan.assets.edges.rings import share_within_rings
 from roadscan.assets.edges.steps import LEAST_STEP_M, HeightRaster, raster_of, step_places
 from roadscan.assets.judgement.judge import Judge
 from roadscan.assets.kernels.columns import mark_corridor
 from roadscan.assets.scene import Scene, once_a_scene
 from roadscan.compute.array_types import Bool, Float64
-from roadscan.compute.arrays import runs_of
 from roadscan.core.extras import cv2
 
 
@@ -64,11 +63,21 @@ class Edge(NamedTuple):
     """(n,) evidence (σ · m) of the places about each node."""
     probability: Float64 | None = None
     """(n,) of a kerb at each node; None where it was not judged."""
+    lap: int = 0
+    """Number of nodes of a lap of a closed line, of which there are three; 0: it is open."""
 
     def at(self, rows: npt.NDArray[np.int64]) -> Edge:
         """Returns the part with some of its nodes, which follow one another."""
         probability = None if self.probability is None else self.probability[rows]
         return Edge(self.nodes.at(rows), self.seen[rows], self.evidence[rows], probability)
+
+    def once(self) -> Edge:
+        """Returns it with one lap, where it is closed: its first and last node are the westernmost."""
+        if not self.lap:
+            return self
+        lap = np.arange(self.lap, 2 * self.lap)
+        lap = np.roll(lap, -np.lexsort((self.nodes.y_m[lap], self.nodes.x_m[lap]))[0])
+        return self.at(np.append(lap, lap[:1]))
 
 
 DEFAULT: Final = EdgeSettings()
@@ -76,7 +85,7 @@ DEFAULT: Final = EdgeSettings()
 
 @once_a_scene
 def edges_of(scene: Scene) -> list[Edge]:
-    """Returns the edges in the window of a scene, the best seen first."""
+    """Returns the edges in the window of a scene, the best seen first; closed ones with three laps."""
     raster, returns = raster_of(scene), scene.returns
     ground = [column[raster.used] for column in (returns.x_m, returns.y_m, returns.height_m)]
     return found_edges(raster, profiles.sorted_heights(*ground))
@@ -87,7 +96,7 @@ def edges_of_raster(raster: HeightRaster) -> list[Edge]:
     row, column = np.nonzero(raster.count > 0)
     x = raster.x_min_m + (column.astype(np.float64) + 0.5) * raster.cell_m
     y = raster.y_min_m + (row.astype(np.float64) + 0.5) * raster.cell_m
-    return found_edges(raster, profiles.sorted_heights(x, y, raster.height_m[row, column]))
+    return [edge.once() for edge in found_edges(raster, profiles.sorted_heights(x, y, raster.height_m[row, column]))]
 
 
 def found_edges(raster: HeightRaster, heights: Heights, settings: EdgeSettings = DEFAULT) -> list[Edge]:
@@ -97,13 +106,13 @@ def found_edges(raster: HeightRaster, heights: Heights, settings: EdgeSettings =
     slopes = raster.slopes
     parts: list[Edge] = []
     for chain in paths_of(step_places(raster)):
-        line = profiles.chain_line(chain)
+        line, lap = profiles.chain_line(chain)
         nodes = profiles.nodes_of(line, heights, raster, slopes, profiles.near_places(line, chain))
-        parts += _measured_runs(nodes, profiles.evidence_at(line, chain), settings)
+        parts += _measured_runs(nodes, profiles.evidence_at(line, chain), lap, settings)
     return _bridged(parts, heights, raster, slopes, settings)
 
 
-def _measured_runs(nodes: Nodes, evidence: Float64, settings: EdgeSettings) -> list[Edge]:
+def _measured_runs(nodes: Nodes, evidence: Float64, lap: int, settings: EdgeSettings) -> list[Edge]:
     """Returns runs of nodes with a measurable step; up to two nodes without are left inside a run."""
     known = np.isfinite(nodes.sigma_step_m)
     low, high, scatter = (_medians_of_five(c, known) for c in (nodes.seen_low, nodes.seen_high_m, nodes.scatter_m))
@@ -112,13 +121,11 @@ def _measured_runs(nodes: Nodes, evidence: Float64, settings: EdgeSettings) -> l
     good &= _medians_of_five(nodes.step_m, known) <= settings.greatest_step_m
     good &= nodes.covered >= settings.covered
     whole = scipy.ndimage.binary_closing(np.pad(good, 3), np.ones(5))[3:-3]
-    number, count = scipy.ndimage.label(whole)
-    edges = []
-    for k in range(1, count + 1):
-        rows = np.flatnonzero(number == k)
-        if (len(rows) - 1) * NODE_M >= settings.least_part_m:
-            edges.append(Edge(nodes.at(rows), good[rows], evidence[rows]))
-    return edges
+    return [
+        Edge(nodes.at(rows), good[rows], evidence[rows], lap=lap if len(rows) == len(good) else 0)
+        for rows in runs_along(whole, lap)
+        if (len(rows) - 1) * NODE_M >= settings.least_part_m
+    ]
 
 
 def _medians_of_five(values: Float64, known: Bool) -> Float64:
@@ -132,7 +139,7 @@ def _medians_of_five(values: Float64, known: Bool) -> Float64:
 def _bridged(
     parts: list[Edge], heights: Heights, raster: HeightRaster, slopes: tuple[Float64, Float64], settings: EdgeSettings
 ) -> list[Edge]:
-    """Returns parts joined over gaps, the shortest gaps first."""
+    """Returns parts joined over gaps, the shortest gaps first; some are closed then."""
     gaps = sorted(
         (gap, i, j)
         for i, j in _near_pairs(parts, settings.bridge_m)
@@ -141,20 +148,32 @@ def _bridged(
     after: dict[int, int] = {}
     before: dict[int, int] = {}
     for _, i, j in gaps:
-        if i not in after and j not in before and not _leads_to(after, j, i):
+        if i not in after and j not in before:
             after[i], before[j] = j, i
     edges = []
-    for i in range(len(parts)):
-        if i in before:
+    done: set[int] = set()
+    for i in [*(i for i in range(len(parts)) if i not in before), *range(len(parts))]:
+        if i in done:
             continue
         edge, at = parts[i], i
-        while at in after:
+        done.add(i)
+        while at in after and after[at] not in done:
             at = after[at]
+            done.add(at)
             edge = _joined(edge, parts[at], heights, raster, slopes, settings)
+        if at in after:
+            edge = _closed(_joined(edge, parts[i], heights, raster, slopes, settings), len(parts[i].seen))
         enough = float(edge.evidence.sum()) >= settings.least_evidence
         if enough and float(edge.seen.sum() - 1) * NODE_M >= settings.least_length_m:
             edges.append(edge)
     return edges
+
+
+def _closed(edge: Edge, again: int) -> Edge:
+    """Returns a closed edge of one that ends with its first nodes, so many, once more."""
+    lap = len(edge.seen) - again
+    rows = np.append(np.tile(np.arange(lap), 3), 0)
+    return edge.at(rows)._replace(lap=lap)
 
 
 def _near_pairs(parts: list[Edge], reach_m: float) -> list[tuple[int, int]]:
@@ -164,15 +183,7 @@ def _near_pairs(parts: list[Edge], reach_m: float) -> list[tuple[int, int]]:
     ends = np.array([[p.nodes.x_m[-1], p.nodes.y_m[-1]] for p in parts])
     begins = np.array([[p.nodes.x_m[0], p.nodes.y_m[0]] for p in parts])
     near = scipy.spatial.cKDTree(begins).query_ball_point(ends, reach_m + 1e-6)
-    return [(i, j) for i, some in enumerate(near) for j in some if i != j]
-
-
-def _leads_to(after: dict[int, int], start: int, end: int) -> bool:
-    while start in after:
-        start = after[start]
-        if start == end:
-            return True
-    return start == end
+    return [(i, j) for i, some in enumerate(near) for j in some if not parts[i].lap and not parts[j].lap]
 
 
 def _gap_m(a: Nodes, b: Nodes, settings: EdgeSettings) -> float | None:
@@ -246,16 +257,20 @@ def node_features(scene: Scene, edges: Sequence[Edge]) -> dict[str, Float64]:
     names = ("x_m", "y_m", "heading_x", "heading_y", "step_m", "sigma_step_m", "seen_low", "covered")
     x, y, ux, uy, step, sigma, seen_low, covered = (np.concatenate([getattr(n, k) for n in nodes]) for k in names)
     place, seen = np.column_stack([x, y, ux, uy]), np.concatenate([edge.seen for edge in edges])
+    ends = np.cumsum([len(n.x_m) for n in nodes])
+    rows = [slice(end - len(n.x_m), end) for end, n in zip(ends, nodes, strict=True)]
+    # Of equal nodes of several laps one stands for all.
+    lap = [np.arange(len(e.seen)) % e.lap if e.lap else np.arange(len(e.seen)) for e in edges]
+    one, again = np.unique(np.concatenate([k.start + at for k, at in zip(rows, lap, strict=True)]), return_inverse=True)
     raster = raster_of(scene)
-    near = np.flatnonzero(raster.used & _near(place, raster)[np.maximum(raster.cell, 0)])
+    near = np.flatnonzero(raster.used & _near(place[one], raster)[np.maximum(raster.cell, 0)])
+    of_returns = _of_returns(scene, place[one])
+    of_returns["within_rings"] = share_within_rings(scene.returns, near, place[one], np.where(seen, step, np.nan)[one])
     measured = {
         "seen_low": seen_low, "covered": covered,
         "significance": np.minimum(step / np.hypot(sigma, _LEAST_SIGMA_M), _MOST_RATIO),
-        "outward": _outward(scene, place), **_of_returns(scene, place),
-        "within_rings": share_within_rings(scene.returns, near, place, np.where(seen, step, np.nan)),
+        "outward": _outward(scene, place), **{name: column[again] for name, column in of_returns.items()},
     }  # fmt: skip
-    ends = np.cumsum([len(n.x_m) for n in nodes])
-    rows = [slice(end - len(n.x_m), end) for end, n in zip(ends, nodes, strict=True)]
     out = {name: np.concatenate([_medians_of_known(column[k]) for k in rows]) for name, column in measured.items()}
     lengths = [np.full(len(edge.seen), min(NODE_M * len(edge.seen), _LONG_M)) for edge in edges]
     evidence = np.concatenate([_evidence_a_metre(edge) for edge in edges])
@@ -361,7 +376,7 @@ def free_edges(scene: Scene) -> list[Edge]:
     features = node_features(scene, edges)
     stated = np.where(features["within_rings"] < _LEAST_WITHIN_RINGS, 0.0, KERB.probability(features))
     ends = np.cumsum([len(edge.seen) for edge in edges])
-    return [part for edge, end in zip(edges, ends, strict=True)
+    return [part.once() for edge, end in zip(edges, ends, strict=True)
             for part in kerb_parts(edge, stated[end - len(edge.seen) : end])]  # fmt: skip
 
 
@@ -387,8 +402,11 @@ def free_parts(edge: Edge, taken: Bool) -> list[Edge]:
 
 def _parts(edge: Edge, chosen: Bool) -> list[Edge]:
     """Returns the runs of an edge's chosen nodes (n,) that are long enough and of which one was seen."""
-    runs = (np.arange(first, end) for first, end in runs_of(chosen))
-    return [edge.at(rows) for rows in runs if (len(rows) - 1) * NODE_M >= _SHORTEST_M and edge.seen[rows].any()]
+    return [
+        edge if len(rows) == len(chosen) else edge.at(rows)
+        for rows in runs_along(chosen, edge.lap)
+        if (len(rows) - 1) * NODE_M >= _SHORTEST_M and edge.seen[rows].any()
+    ]
 
 
 def means_about(values: Float64, nodes: int) -> Float64:

@@ -118,7 +118,8 @@ def columns_of(edge: Edge) -> Float64:
 def cut_at(nodes: Float64, tile: Box) -> list[CutEdge]:
     """Returns parts of a line (n, columns) within a tile; ends on its border are interpolated between nodes.
 
-    A part ends on the border also where a node lies on it: the line may go on in the next tile.
+    A part ends on the border also where a node lies on it: the line may go on in the next tile. A closed line, whose
+    last node is its first, is not cut there.
     """
     parts: list[list[Float64]] = []
     cuts: list[list[bool]] = []
@@ -132,7 +133,11 @@ def cut_at(nodes: Float64, tile: Box) -> list[CutEdge]:
             cuts.append([t0 > 0.0 or _on_border(a, tile), False])
         parts[-1].append(_between(a, b, t1))
         cuts[-1][1] = t1 < 1.0 or _on_border(b, tile)
-    return [CutEdge(np.array(p), *c) for p, c in zip(parts, cuts, strict=True)]
+    found = [CutEdge(np.array(p), *c) for p, c in zip(parts, cuts, strict=True)]
+    if len(found) > 1 and (nodes[0, :2] == nodes[-1, :2]).all() and not (found[0].cut_first or found[-1].cut_last):
+        both = np.concatenate([found[-1].nodes, found[0].nodes[1:]])
+        found = [CutEdge(both, found[-1].cut_first, found[0].cut_last), *found[1:-1]]
+    return found
 
 
 def _on_border(node: Float64, tile: Box) -> bool:
@@ -165,14 +170,20 @@ def pieces_table(
     parts: Sequence[CutEdge], scene: Scene, raster: HeightRaster, schema: pa.Schema = LINE_PIECES
 ) -> pa.Table:
     """Returns rows of a schema of :func:`line_schema`: parts of lines in the map, with what saw them."""
-    corner = scene.returns.corner_m
     seen = seen_by([p.nodes[:, :2] for p in parts], scene, raster)
+    in_map = []
+    for part in parts:
+        nodes = part.nodes.copy()
+        nodes[:, :2] += scene.returns.corner_m
+        in_map.append(part._replace(nodes=nodes))
+    return lines_table(in_map, seen, schema)
+
+
+def lines_table(parts: Sequence[CutEdge], seen: Sequence[Seen], schema: pa.Schema) -> pa.Table:
+    """Returns rows of a schema of :func:`line_schema`: parts of lines, places in the map, with what saw each."""
     columns: dict[str, list[Any]] = {name: [] for name in schema.names}
     for part, one in zip(parts, seen, strict=True):
-        nodes = part.nodes.copy()
-        nodes[:, 0] += corner[0]
-        nodes[:, 1] += corner[1]
-        for name, column in zip(node_names(schema), nodes.T, strict=True):
+        for name, column in zip(node_names(schema), part.nodes.T, strict=True):
             columns[name].append(column)
         columns["returns"].append(one.returns)
         columns["passes"].append(list(one.passes))
@@ -256,8 +267,19 @@ def joined_lines(pieces: pa.Table) -> list[Line]:
             at = after[at]
             done.add(at)
             line = _end_to_end(line, lines[at])
-        found.append(line)
+        found.append(_closed(line) if after.get(at) == start else line)
     return found
+
+
+def _closed(line: Line) -> Line:
+    """Returns a line whose end goes on in its beginning, closed: its first and last node are the westernmost."""
+    return line._replace(nodes=closed_nodes(_end_to_end(line, line).nodes[len(line.nodes) - 1 : -1]))
+
+
+def closed_nodes(nodes: Float64) -> Float64:
+    """Returns the nodes (n + 1, columns) of the closed line through nodes (n, columns) from the westernmost on."""
+    first = np.lexsort((nodes[:, 1], nodes[:, 0]))[0]
+    return np.concatenate([nodes[first:], nodes[: first + 1]])
 
 
 def _line(row: dict[str, Any], names: tuple[str, ...]) -> Line:

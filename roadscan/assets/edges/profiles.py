@@ -17,7 +17,7 @@ from roadscan.assets.edges.steps import LEAST_STEP_M, HeightRaster, Places
 from roadscan.assets.kernels import step_profiles as kernel
 from roadscan.assets.kernels.edge_links import MAX_LINKS, best_ways, find_links, trace
 from roadscan.compute.array_types import Bool, Float64, Int64
-from roadscan.compute.arrays import way_along
+from roadscan.compute.arrays import runs_of, way_along
 
 FREE_M: Final = 0.3
 """Distance of consecutive places (m) that is no gap."""
@@ -66,6 +66,8 @@ class Chain(NamedTuple):
     places: Places
     gains: Float64
     """Evidence (σ · m) from each place to the next."""
+    closed: bool = False
+    """Whether the first place follows the last one; the first is the westernmost, wherever a scene found it."""
 
     @property
     def evidence(self) -> float:
@@ -103,8 +105,29 @@ def paths_of(places: Places, settings: PathSettings = DEFAULT) -> list[Chain]:
     )
     ends = np.searchsorted(chain[:length, 0], np.arange(number + 1))
     found = (chain[a:b, 1] for a, b in itertools.pairwise(ends))
-    chains = (Chain(places.at(rows), _gains(place[rows], quality[rows], settings)) for rows in found)
+    chains = (
+        Chain(places.at(rows), _gains(place[ways], quality[ways], settings), closed)
+        for chain in found
+        for rows, closed in _opened(chain, following, place, settings.beside_m)
+        for ways in (np.append(rows, rows[:1]) if closed else rows,)
+    )
     return sorted((c for c in chains if c.evidence >= settings.begin), key=lambda c: -c.evidence)
+
+
+def _opened(rows: Int64, following: Int64, place: Float64, beside_m: float) -> list[tuple[Int64, bool]]:
+    """Returns the places of the lines that a chain is made of, and whether each is closed.
+
+    A chain whose last place leads back to one of its places goes round from there. Those before lead into the round,
+    as far as they do not lie beside it.
+    """
+    again = np.flatnonzero(rows == following[rows[-1]])
+    if not again.size:
+        return [(rows, False)]
+    ring, before = rows[again[0] :], rows[: again[0]]
+    ring = np.roll(ring, -np.lexsort((place[ring, 1], place[ring, 0]))[0])
+    beside = scipy.spatial.cKDTree(place[ring, :2]).query(place[before, :2])[0] <= beside_m
+    before = before[: np.argmax(beside)] if beside.any() else before
+    return [(ring, True), (before, False)] if len(before) >= 2 else [(ring, True)]
 
 
 def _gains(place: Float64, quality: Float64, settings: PathSettings) -> Float64:
@@ -201,9 +224,42 @@ def sorted_heights(x_m: Float64, y_m: Float64, height_m: Float64) -> Heights:
     return Heights(x_m[order], y_m[order], height_m[order], starts, bins)
 
 
-def chain_line(chain: Chain) -> Float64:
-    """Returns points (k, 2) at even distances along a chain of places."""
-    return even_nodes(np.column_stack(chain.places[:2]), NODE_M)
+_LAPS: Final = 3
+"""A closed line is followed so often: in the second lap nothing depends on where it begins."""
+
+
+def chain_line(chain: Chain) -> tuple[Float64, int]:
+    """Returns points (k, 2) at even distances along a chain of places, and how many are a lap.
+
+    That is 0 of an open chain. Of a closed one there are three laps, and the first point once more.
+    """
+    places = np.column_stack(chain.places[:2])
+    if not chain.closed:
+        return even_nodes(places, NODE_M), 0
+    line = even_nodes(np.concatenate([places] * _LAPS + [places[:1]]), NODE_M)
+    middle = len(line) // 2
+    same = np.flatnonzero(np.hypot(*(line[middle + 1 :] - line[middle]).T) < 1e-6)
+    if same.size:
+        return line, int(same[0]) + 1
+    # No lattice fixes the points of so small a line: they count from its westernmost place.
+    way = way_along(line)
+    at = np.linspace(way[-1] / _LAPS, 2.0 * way[-1] / _LAPS, max(round(way[-1] / _LAPS / NODE_M), 3), endpoint=False)
+    lap = np.column_stack([np.interp(at, way, line[:, k]) for k in range(2)])
+    return np.concatenate([lap] * _LAPS + [lap[:1]]), len(lap)
+
+
+def runs_along(flags: Bool, lap: int) -> list[Int64]:
+    """Returns the rows of runs of true flags (n,) along a line; lap : as :func:`chain_line` has it.
+
+    Of a closed line they are rows of the second lap, or all rows where that is one run.
+    """
+    if not lap:
+        return [np.arange(first, end) for first, end in runs_of(flags)]
+    second = flags[lap : 2 * lap]
+    if second.all():
+        return [np.arange(len(flags))]
+    runs = (np.arange(first, end) for first, end in runs_of(np.tile(second, 3)) if lap <= first < 2 * lap)
+    return [lap + rows % lap for rows in runs]
 
 
 def evidence_at(line: Float64, chain: Chain) -> Float64:
@@ -211,8 +267,10 @@ def evidence_at(line: Float64, chain: Chain) -> Float64:
     places = np.column_stack(chain.places[:2])
     total = np.append(0.0, np.cumsum(chain.gains))
     at = total[scipy.spatial.cKDTree(places).query(line)[1]]
+    if chain.closed:
+        at = np.unwrap(at, period=total[-1])
     middles = 0.5 * (at[1:] + at[:-1])
-    return np.diff(np.concatenate([total[:1], middles, total[-1:]]))
+    return np.diff(np.concatenate([at[:1], middles, at[-1:]] if chain.closed else [total[:1], middles, total[-1:]]))
 
 
 def near_places(line: Float64, chain: Chain) -> Bool:

@@ -10,7 +10,7 @@ import scipy.spatial
 
 from roadscan.assets import classes
 from roadscan.assets.bins import cells_of, in_bins
-from roadscan.assets.edges.along_drive import tracks_of
+from roadscan.assets.edges.tracks import tracks_of
 from roadscan.assets.scene import Returns, Scene
 from roadscan.compute.array_types import Float64, Int64
 

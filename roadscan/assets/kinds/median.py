@@ -10,7 +10,7 @@ import pyarrow as pa
 import shapely
 from pydantic import Field
 
-from roadscan.assets.edges.along_drive import BESIDE_PIECES, pieces_beside
+from roadscan.assets.edges.beside import BESIDE_PIECES, pieces_beside
 from roadscan.assets.edges.line_pieces import Strip, joined_lines, polygon_of, sigma_width_m, strips_of
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence
 from roadscan.assets.scene import Scene

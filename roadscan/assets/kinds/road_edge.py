@@ -12,10 +12,9 @@ import pyarrow as pa
 import shapely
 from pydantic import Field
 
-from roadscan.assets.edges.along_drive import EDGE_COLUMNS, FARTHEST_M, road_edges
 from roadscan.assets.edges.grey import with_pictured
-from roadscan.assets.edges.line_pieces import Line, joined_lines, line_schema, pieces_table
-from roadscan.assets.edges.steps import raster_of
+from roadscan.assets.edges.line_pieces import Line, joined_lines
+from roadscan.assets.edges.road_edges import REACH_M, STATION_PIECES, edge_lines, station_pieces
 from roadscan.assets.green.edges import moved_to_green
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence
 from roadscan.assets.scene import Scene
@@ -36,13 +35,17 @@ class RoadEdge(AssetKind):
     title: ClassVar[str] = "edges of the carriageway: kerbs, verges, barriers"
     curve: ClassVar[str] = "edges"
     options: ClassVar[type[Strict]] = RoadEdgeOptions
-    reach_m: ClassVar[float] = FARTHEST_M
-    """An edge is sought from the drive, this far away at the most."""
-    piece_schema: ClassVar[pa.Schema] = line_schema(EDGE_COLUMNS)
+    reach_m: ClassVar[float] = REACH_M
+    """An edge is sought from the drive, and a square tells of its own stations."""
+    piece_schema: ClassVar[pa.Schema] = STATION_PIECES
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:
-        """Returns edges beside the drives within the scene's tile."""
-        return Evidence(pieces_table(road_edges(scene), scene, raster_of(scene), self.piece_schema))
+        """Returns what lies across the drives within the scene's tile, and the kerbs there."""
+        return Evidence(station_pieces(scene))
+
+    def joined(self, pieces: pa.Table) -> pa.Table:
+        """Returns the edges along the drives."""
+        return edge_lines(pieces)
 
     sees_green: ClassVar[bool] = True
 

@@ -13,8 +13,8 @@ import scipy.ndimage
 import shapely
 from pydantic import Field
 
-from roadscan.assets.edges.along_drive import FARTHEST_M, road_edges
 from roadscan.assets.edges.line_pieces import dense, ribbon
+from roadscan.assets.edges.road_edges import FARTHEST_M, places_across
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, KindOptions
 from roadscan.assets.scene import Scene
 from roadscan.compute.array_types import Float64
@@ -52,11 +52,10 @@ class Shoulder(AssetKind):
     )
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:
-        """Returns the first node of each road edge within the tile: a mark that there may be a shoulder."""
-        corner = scene.returns.corner_m
-        marks = [(corner[0] + part.nodes[0, 0], corner[1] + part.nodes[0, 1]) for part in road_edges(scene)]
-        columns = {"easting_m": [m[0] for m in marks], "northing_m": [m[1] for m in marks]}
-        return Evidence(pa.table(columns, schema=self.piece_schema))
+        """Returns one place in the tile where a road edge could lie: a mark that there may be a shoulder."""
+        places = places_across(scene)
+        marks = places[scene.tile.holds(*places.T)][:1] + scene.returns.corner_m
+        return Evidence(pa.table([marks[:, 0], marks[:, 1]], schema=self.piece_schema))
 
     def objects(
         self, pieces: pa.Table, options: Any, others: Mapping[str, Sequence[AssetObject]]

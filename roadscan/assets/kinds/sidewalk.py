@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 from pydantic import Field
 
-from roadscan.assets.edges.along_drive import BESIDE_PIECES, pieces_beside
+from roadscan.assets.edges.beside import BESIDE_PIECES, pieces_beside
 from roadscan.assets.edges.line_pieces import Strip, joined_lines, polygon_of, running_slope, sigma_width_m, strips_of
 from roadscan.assets.edges.profiles import REACH_M
 from roadscan.assets.green.edges import ended_at_green

@@ -174,6 +174,7 @@ def _joined(task: JoinTask) -> OutputRecord:
     kind, schema = asset_kinds()[name], asset_schema(name).arrow()
     wanted = kind.piece_schema
     pieces = pa.concat_tables([wanted.empty_table(), *(read_as(task.store, r, wanted) for r in task.pieces)])
+    pieces = kind.joined(pieces)
     if task.pictured:
         pieces = kind.with_pictures(pieces, pa.concat_tables([recorded_table(task.store, r) for r in task.pictured]))
     if task.edges:

@@ -11,8 +11,8 @@ import scipy.ndimage
 import scipy.spatial
 import shapely
 
-from roadscan.assets.edges.along_drive import EDGE_COLUMNS
-from roadscan.assets.edges.line_pieces import cut_at, line_schema
+from roadscan.assets.edges.line_pieces import cut_at
+from roadscan.assets.edges.road_edges import EDGE_COLUMNS, EDGE_LINES
 from roadscan.assets.green.areas import in_raster
 from roadscan.assets.green.cells import CELL_M
 from roadscan.assets.green.colours import FINE, FINE_M
@@ -22,7 +22,7 @@ from roadscan.assets.tasks.pictured_paint import Window
 from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.compute.arrays import SIGMA_OF_MAD, scatter_about
 
-GREY_EDGES: Final = line_schema(EDGE_COLUMNS)
+GREY_EDGES: Final = EDGE_LINES
 """Columns of a piece of an edge, as those that returns show."""
 _LEAST: Final = 2
 """Pictures that must show a fine cell."""

@@ -19,7 +19,7 @@ from roadscan.assets.kinds.shoulder import Shoulder, ShoulderOptions
 from roadscan.assets.kinds.sidewalk import Sidewalk, SidewalkOptions
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.scene import Box, Scene
-from roadscan.compute.edges import edge_along
+from roadscan.compute.edges import counted, evidence_across, path_along
 from roadscan.simulate import Scene as SimulatedScene
 from roadscan.simulate.surface import Surface
 from tests.assets.edges.simulated import SimulatedStreet, town_street
@@ -69,7 +69,7 @@ def test_sidewalks_reach_from_the_kerb_to_the_facade(street: SimulatedStreet, to
 @pytest.mark.nightly
 def test_road_edges_lie_at_the_kerbs_on_their_sides(street: SimulatedStreet, town: Scene) -> None:
     kind = RoadEdge()
-    found = list(kind.objects(kind.evidence(town, RoadEdgeOptions()).pieces, RoadEdgeOptions(), {}))
+    found = list(kind.objects(kind.joined(kind.evidence(town, RoadEdgeOptions()).pieces), RoadEdgeOptions(), {}))
     for side, sign in (("left", -1.0), ("right", 1.0)):
         lines = [np.array(o.geometry.coords) for o in found if o.attributes["side"] == side]
         places = np.concatenate(lines)
@@ -154,7 +154,7 @@ def test_a_sidewalk_has_slopes_a_kerb_and_a_ramp_where_its_kerb_is_dropped(ramp:
 @pytest.mark.slow
 def test_a_road_may_have_edges_on_one_side_alone() -> None:
     kind = RoadEdge()
-    pieces = kind.evidence(island(2.4, 0.15), RoadEdgeOptions()).pieces
+    pieces = kind.joined(kind.evidence(island(2.4, 0.15), RoadEdgeOptions()).pieces)
     for right in (False, True):
         own = pieces.filter(pa.array([(row[0] > 0.5) == right for row in pieces["right"].to_pylist()], pa.bool_()))
         assert {o.attributes["side"] for o in kind.objects(own, RoadEdgeOptions(), {})} <= {
@@ -206,7 +206,7 @@ def test_sides_slopes_and_heights_beside_a_road_that_climbs() -> None:
         step = 0.02 if one.attributes["type"] == "dropped" else 0.12
         assert one.attributes["step_m"] == pytest.approx(step, abs=0.008)
         assert np.median(z - (99.88 + 0.03 * x)) == pytest.approx(step, abs=0.01)
-    edges = list(edge.objects(edge.evidence(scene, RoadEdgeOptions()).pieces, RoadEdgeOptions(), {}))
+    edges = list(edge.objects(edge.joined(edge.evidence(scene, RoadEdgeOptions()).pieces), RoadEdgeOptions(), {}))
     assert {o.attributes["side"] for o in edges} == {"left", "right"}
     for one in edges:
         x, y, z = shapely.get_coordinates(one.geometry, include_z=True).T
@@ -224,7 +224,8 @@ def test_the_edge_of_a_road_without_kerbs_is_where_its_verge_begins() -> None:
     e, n, _ = surface.place(station[:, None], np.broadcast_to(offset, (station.size, offset.size)))
     height = surface.height_m(e, n, texture=False)
     height += np.random.default_rng(2).normal(0.0, 0.008, height.shape)
-    found = edge_along(height, np.full(height.shape, 0.008), (0.5, 0.1))
+    step, bend = evidence_across(height, np.full(height.shape, 0.008), (0.5, 0.1))
+    found = path_along(counted(np.fmax(np.abs(step), np.abs(bend))), (0.5, 0.1))
     assert np.median(np.abs(offset[found.cell] - paved)) <= 0.15
     assert np.mean(np.abs(offset[found.cell] - paved) <= 0.3) >= 0.9
     assert found.evidence.min() > 0.5

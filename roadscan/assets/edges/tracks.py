@@ -1,0 +1,92 @@
+"""Stations along the drives of a scene: the same for every scene that holds what lies around them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+import numpy as np
+import scipy.ndimage
+import scipy.spatial
+
+from roadscan.assets.edges.profiles import stops
+from roadscan.compute.array_types import Bool, Float64, Int64
+from roadscan.compute.arrays import runs_of, way_along
+
+STATION_M: Final = 0.5  # Distance of stations along the drive (m).
+_LATTICE_M: Final = 3.0
+"""Stations lie where the drive crosses a lattice of this edge (m), and evenly between: wherever it enters a scene."""
+SAME_ROAD_M: Final = 8.0
+"""A drive this near (m) to an earlier one is on the same road: its edges are found from the earlier."""
+_BESIDE_M: Final = 0.6
+"""What a pass drove earlier lies beside a station, not before or behind it, if it is this near along (m) …"""
+_PARALLEL: Final = 0.7
+"""… and runs within 45° of its heading, or against it (cosine)."""
+_STANDS_M, _STRAIGHT = 0.5, 0.5
+"""A drive moves where this way (m) before and behind a place leads away by this share of it: jitter does not."""
+_FEWEST_STATIONS: Final = 4  # Stations of a track.
+
+
+class Track(NamedTuple):
+    """Stations of a drive: places (n, 2) and unit vectors (n, 2) along it."""
+
+    places: Float64
+    heading: Float64
+    pass_id: int
+
+
+def tracks_of(drive_xyh_m: Float64) -> Iterator[Track]:
+    """Yields stations each half metre of each pass, where nothing drove beside it earlier, neither it nor another."""
+    earlier = np.zeros((0, 2))
+    for number in np.unique(drive_xyh_m[:, 3]):
+        driven = drive_xyh_m[drive_xyh_m[:, 3] == number, :2]
+        # A jump means that the vehicle left the window between.
+        jumps = np.flatnonzero(np.hypot(*np.diff(driven, axis=0).T) > 5.0) + 1
+        parts = [part for one in np.split(driven, jumps) if way_along(part := _moving(one))[-1] >= 2.0 * STATION_M]
+        if parts:
+            yield from _stations(parts, earlier, int(number))
+            earlier = np.concatenate([earlier, *parts])
+
+
+def _moving(places: Float64) -> Float64:
+    """Returns the places (k, 2) of a drive without those where it stands: there it does not come away."""
+    places = places[np.append(True, np.hypot(*np.diff(places, axis=0).T) > 0.0)]
+    way = way_along(places)
+    ends = np.clip(way + np.array([[-_STANDS_M], [_STANDS_M]]), 0.0, way[-1])
+    first, last = (np.column_stack([np.interp(at, way, places[:, k]) for k in range(2)]) for at in ends)
+    return np.asarray(places[np.hypot(*(last - first).T) >= _STRAIGHT * (ends[1] - ends[0])])
+
+
+def _stations(parts: list[Float64], earlier: Float64, number: int) -> Iterator[Track]:
+    found = [stops(part, STATION_M, _LATTICE_M) for part in parts]
+    headings = []
+    for one in found:
+        smooth = scipy.ndimage.gaussian_filter1d(one, 4.0, axis=0, mode="nearest", truncate=2.0)
+        heading = np.gradient(smooth, axis=0)
+        headings.append(heading / np.maximum(np.hypot(*heading.T), 1e-9)[:, None])
+    places, heading = np.concatenate(found), np.concatenate(headings)
+    part = np.repeat(np.arange(len(found)), [len(one) for one in found])
+    free = ~_came_back(places, heading, part)
+    if len(earlier):
+        free &= scipy.spatial.cKDTree(earlier).query(places)[0] > SAME_ROAD_M
+    for first, end in runs_of(free):
+        for rows in np.split(np.arange(first, end), np.flatnonzero(np.diff(part[first:end])) + 1):
+            if len(rows) >= _FEWEST_STATIONS:
+                yield Track(places[rows], heading[rows], number)
+
+
+def _came_back(places: Float64, heading: Float64, part: Int64) -> Bool:
+    """Returns a mask (n,) of stations beside which the same pass drove before, there or back.
+
+    Before is what it drove until it last was out of reach of the station, or turned away from its heading. So neither
+    a bend nor what is just behind counts, and nothing farther away does.
+    """
+    came_back = np.zeros(len(places), np.bool_)
+    for k, some in enumerate(scipy.spatial.cKDTree(places).query_ball_point(places, SAME_ROAD_M, return_sorted=True)):
+        near = np.array(some[: some.index(k)], np.int64)
+        cosine = heading[near] @ heading[k]
+        onward = near[(cosine >= 0.0) & (part[near] == part[k])][::-1]
+        begun = k - np.count_nonzero(onward == k - 1 - np.arange(len(onward)))
+        beside = np.abs((places[near] - places[k]) @ heading[k]) <= _BESIDE_M
+        came_back[k] = bool(np.any((near < begun) & beside & (np.abs(cosine) >= _PARALLEL)))
+    return came_back

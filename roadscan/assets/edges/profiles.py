@@ -23,8 +23,9 @@ FREE_M: Final = 0.3
 """Distance of consecutive places (m) that is no gap."""
 
 
-REACH_M: Final = 14.0
-"""What lies farther from a square (m) does not change its kerbs: the way of a path, the reach of a step, and a node."""
+REACH_M: Final = 18.5
+"""What lies farther from a square (m) does not change its kerbs: evidence along 10 m, the reach of a step and of a node,
+and along 5 m the means of probabilities, holes and the shortest length."""
 
 
 class PathSettings(NamedTuple):

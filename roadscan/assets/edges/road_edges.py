@@ -35,13 +35,11 @@ from roadscan.assets.edges.steps import CELL_M, raster_of
 from roadscan.assets.edges.tracks import STATION_M, Track, tracks_of
 from roadscan.assets.scene import Scene, once_a_scene
 from roadscan.compute.array_types import Bool, Float64, Int64
-from roadscan.compute.edges import counted, evidence_across, moved_cells, path_along
+from roadscan.compute.edges import EdgePath, counted, evidence_across, moved_cells, path_along
 
 NEAREST_M: Final = 0.8  # Edges are sought from this distance to the drive (m) …
 FARTHEST_M: Final = 14.0
 """… to this distance (m)."""
-REACH_M: Final = FARTHEST_M + 0.5
-"""What lies farther from a station (m) tells nothing of it: heights are means of cells up to 0.4 m away."""
 _WITHIN_M: Final = 7.0
 """Edges this far along the drive (m) tell where one lies."""
 _ROUND_M: Final = 3.0
@@ -57,6 +55,10 @@ _BEHIND: Final = 3  # Cells where something stands; what is behind more of them 
 _SIGMA_M: Final = 0.008  # 1 σ of the height of a cell (m).
 _NEAR: Final = np.arange(-2, 3)
 """Cells about an edge's place that tell what it is, and whose returns saw it."""
+_BLOCK: Final = 20_000
+"""Stations (10 km) whose edge is sought at once …"""
+_AROUND: Final = 60
+"""… with so many more (30 m) to both sides: the way of 7 m and the mean over 10 m end before."""
 _STEPS: Final = 40.0  # Evidence is stored in these parts of a σ: it is 6 σ at the most.
 EDGE_COLUMNS: Final = (*NODE_COLUMNS, "by_surface", "by_kerb", "by_barrier", "right", "evidence")
 EDGE_LINES: Final = line_schema(EDGE_COLUMNS)
@@ -257,7 +259,7 @@ def _one_side(
     out = _right_of(some.place[:, 2:4]) * (1.0 if right else -1.0)
     side = int(right)
     up = _kerbs_across(some.place[:, :2], out, kerbs, segments)
-    found = path_along(np.where(up, _KERB, some.evidence[:, side] / _STEPS), (STATION_M, CELL_M), within_m=_WITHIN_M)
+    found = _path(up, some.evidence[:, side])
     near = np.clip(found.cell[:, None] + _NEAR, 0, _OFFSETS.size - 1)
     by_kerb, by_barrier = (
         scipy.ndimage.median_filter(np.take_along_axis(shown, near, axis=1).any(axis=1).astype(np.float64), 5)
@@ -285,6 +287,21 @@ def _one_side(
             int(returns[rows].sum()), tuple(passes), int(some.first_epoch_gps_ns[rows].min()),
             int(some.last_epoch_gps_ns[rows].max()),
         )  # fmt: skip
+
+
+def _path(up: Bool, evidence: npt.NDArray[np.uint8]) -> EdgePath:
+    """Returns the edge along stations (n,), block after block, so that a long drive needs little memory.
+
+    up : (n, offsets) cells at a kerb; evidence : (n, offsets) of the others, in parts of a σ.
+    """
+    found = []
+    for first in range(0, len(up), _BLOCK):
+        begin = max(first - _AROUND, 0)
+        rows, own = slice(begin, first + _BLOCK + _AROUND), slice(first - begin, first - begin + _BLOCK)
+        part = np.where(up[rows], _KERB, evidence[rows] / _STEPS)
+        path = path_along(part, (STATION_M, CELL_M), within_m=_WITHIN_M)
+        found.append((path.cell[own], path.evidence[own]))
+    return EdgePath(*map(np.concatenate, zip(*found, strict=True)))
 
 
 def _lap(line: Float64) -> int:

@@ -12,6 +12,7 @@ from pydantic import Field
 
 from roadscan.assets.edges.beside import BESIDE_PIECES, pieces_beside
 from roadscan.assets.edges.line_pieces import Strip, joined_lines, polygon_of, sigma_width_m, strips_of
+from roadscan.assets.edges.profiles import REACH_M
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence
 from roadscan.assets.scene import Scene
 from roadscan.core.strict import Strict
@@ -38,6 +39,7 @@ class Median(AssetKind):
     title: ClassVar[str] = "medians: raised strips between two kerbs"
     curve: ClassVar[str] = "products"
     options: ClassVar[type[Strict]] = MedianOptions
+    reach_m: ClassVar[float] = REACH_M
     piece_schema: ClassVar[pa.Schema] = BESIDE_PIECES
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:

@@ -14,7 +14,8 @@ from pydantic import Field
 
 from roadscan.assets.edges.grey import with_pictured
 from roadscan.assets.edges.line_pieces import Line, joined_lines
-from roadscan.assets.edges.road_edges import REACH_M, STATION_PIECES, edge_lines, station_pieces
+from roadscan.assets.edges.profiles import REACH_M
+from roadscan.assets.edges.road_edges import STATION_PIECES, edge_lines, station_pieces
 from roadscan.assets.green.edges import moved_to_green
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence
 from roadscan.assets.scene import Scene
@@ -36,7 +37,7 @@ class RoadEdge(AssetKind):
     curve: ClassVar[str] = "edges"
     options: ClassVar[type[Strict]] = RoadEdgeOptions
     reach_m: ClassVar[float] = REACH_M
-    """An edge is sought from the drive, and a square tells of its own stations."""
+    """A square tells of its own stations, across which an edge is sought 14 m far, and of its kerbs."""
     piece_schema: ClassVar[pa.Schema] = STATION_PIECES
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:

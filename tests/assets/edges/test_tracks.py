@@ -7,6 +7,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial import cKDTree
 
+from roadscan.assets.edges import road_edges
 from roadscan.assets.edges.tracks import SAME_ROAD_M, tracks_of
 from roadscan.compute.arrays import way_along
 
@@ -90,3 +91,15 @@ def test_any_window_has_the_stations_of_the_whole_drive(drive: Float64) -> None:
             assert cKDTree(ours).query(others)[0].max() < 1e-9
         found += len(ours)
     assert found > 100
+
+
+def test_an_edge_is_the_same_in_blocks_of_any_length(monkeypatch: pytest.MonkeyPatch) -> None:
+    draw = np.random.default_rng(1)
+    up = draw.random((1500, 133)) < 0.002
+    evidence = (240.0 * draw.random(up.shape) ** 6).astype(np.uint8)
+    whole = road_edges._path(up, evidence)
+    for block in (97, 700):
+        monkeypatch.setattr(road_edges, "_BLOCK", block)
+        cell, mean = road_edges._path(up, evidence)
+        assert (cell == whole.cell).all()
+        assert np.allclose(mean, whole.evidence, rtol=0.0, atol=1e-9)

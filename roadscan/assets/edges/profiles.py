@@ -24,7 +24,7 @@ FREE_M: Final = 0.3
 
 
 REACH_M: Final = 18.5
-"""What lies farther from a square (m) does not change its kerbs: evidence along 10 m, the reach of a step and of a node,
+"""What lies farther from a square (m) does not change its kerbs: evidence along 10 m, the reach of a step and a node,
 and along 5 m the means of probabilities, holes and the shortest length."""
 
 

@@ -101,7 +101,8 @@ def station_pieces(scene: Scene) -> pa.Table:
     found = _stations_of(scene)
     if found is None:
         return STATION_PIECES.empty_table()
-    chosen = np.flatnonzero(scene.tile.holds(*found.place[:, :2].T) & found.returns.any(axis=(1, 2)))
+    # Stations lie on the border of squares, where each must find the same one of them in one square.
+    chosen = np.flatnonzero(scene.tile.holds(*found.place[:, :2].round(6).T) & found.returns.any(axis=(1, 2)))
     kerbs = [part.nodes[:, :2] for edge in free_edges(scene) for part in cut_at(columns_of(edge), scene.tile)]
     if not chosen.size and not kerbs:
         return STATION_PIECES.empty_table()

@@ -15,7 +15,7 @@ from roadscan.assets.bins import cells_of, in_bins, sums_around
 from roadscan.assets.green.colours import FINE, FINE_M
 from roadscan.assets.kernels.low_returns import low_moments
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence
-from roadscan.assets.pass_heights import heights_of_one_pass_m
+from roadscan.assets.pass_heights import CellGrid, PassMoments, heights_of_one_pass_m, pass_moments
 from roadscan.assets.scene import Scene
 from roadscan.assets.upright.panels import panels_of
 from roadscan.assets.upright.slices import touching
@@ -96,13 +96,14 @@ def grown_cells(scene: Scene, options: LandscapeOptions) -> pa.Table:
                   ((tile.y_min_m, tile.y_max_m), (tile.x_min_m, tile.x_max_m)))  # fmt: skip
     shape = (inner[0] + 2 * margin, inner[1] + 2 * margin)
     flat = _flat_ones(scene)
-    above = _heights_m(scene, flat, corner, shape)
-    sums = _sums(scene, above, flat, corner, shape)
-    counted, rough = _roughness(sums)
-    road = _cells_with(scene, classes.ROAD, corner, shape) & counted
-    even = road_roughness_m(scene, rough, road)
+    grid = CellGrid(corner, CELL_M, shape)
+    moments = pass_moments(scene, flat, np.array(_LOW_M), grid)
+    even = _road_roughness_m(scene, moments, grid)
     if even is None:
         return PIECE_SCHEMA.empty_table()
+    above = heights_of_one_pass_m(scene, flat, moments, options.rough_ratio * even, grid)
+    sums = _sums(scene, above, flat, corner, shape)
+    counted, rough = _roughness(sums)
     ratio = rough / even
     wall = _cells_with(scene, classes.BUILDING, corner, shape, _WALL_M).view(np.uint8)
     wall = cv2.dilate(wall, _POOLED, iterations=2) > 0
@@ -177,14 +178,18 @@ def roughness_of_road_m(scene: Scene) -> float | None:
     box = scene.extent
     corner = np.array([box.x_min_m, box.y_min_m])
     shape = round((box.y_max_m - box.y_min_m) / CELL_M), round((box.x_max_m - box.x_min_m) / CELL_M)
-    low = _low_ones(scene)
-    counted, rough = _roughness(_sums(scene, _heights_m(scene, low, corner, shape), low, corner, shape))
-    return road_roughness_m(scene, rough, _cells_with(scene, classes.ROAD, corner, shape) & counted)
+    grid = CellGrid(corner, CELL_M, shape)
+    return _road_roughness_m(scene, pass_moments(scene, _low_ones(scene), np.array(_LOW_M), grid), grid)
 
 
-def road_roughness_m(scene: Scene, rough_m: Float64, road: Bool) -> float | None:
-    """Returns the scatter of the heights of the survey's road (m), from cells (rows, columns) where it is not known."""
-    return scene.statistics.of("road_roughness_m", 0.5, lambda: rough_m[road])
+def _road_roughness_m(scene: Scene, moments: PassMoments, grid: CellGrid) -> float | None:
+    """Returns how the heights of the survey's road scatter within passes (m): by this scene where it is not known."""
+
+    def of_scene() -> Float64:
+        road = _cells_with(scene, classes.ROAD, grid.corner, grid.shape)
+        return moments.scatter_m()[road & (moments.sums[:, 0].sum(axis=0) >= _LEAST_RETURNS)]
+
+    return scene.statistics.of("road_roughness_m", 0.5, of_scene)
 
 
 def _roughness(sums: Float64) -> tuple[Bool, Float64]:
@@ -208,11 +213,6 @@ def _flat_ones(scene: Scene) -> Bool:
         if float(np.hypot(*np.diff(panel.xy_m, axis=0).T).sum()) > _LONG_M:
             counted[panel.rows] = False
     return counted
-
-
-def _heights_m(scene: Scene, counted: Bool, corner: Float64, shape: tuple[int, int]) -> Float32:
-    """Returns heights above the ground (n,) (m), without what passes differ: plants scatter within a pass."""
-    return heights_of_one_pass_m(scene, counted, np.array(_LOW_M), corner, CELL_M, shape)
 
 
 def _sums(

@@ -45,7 +45,7 @@ class PassMoments(NamedTuple):
         number, total, square = np.moveaxis(self.sums, 1, 0)
         within = (square - total * total / np.maximum(number, 1.0)).sum(axis=0)
         free = number.sum(axis=0) - np.maximum((number > 0.5).sum(axis=0) - 1, 0)
-        return np.sqrt(np.maximum(within / np.maximum(free, 1.0), 1e-8))
+        return np.asarray(np.sqrt(np.maximum(within / np.maximum(free, 1.0), 1e-8)))
 
 
 def pass_moments(scene: Scene, counted: Bool, limits_m: Float64, grid: CellGrid) -> PassMoments:
@@ -55,13 +55,13 @@ def pass_moments(scene: Scene, counted: Bool, limits_m: Float64, grid: CellGrid)
     sources = np.unique(source[counted])
     sums = np.zeros((sources.size, 3, *grid.shape))
     for k, one in enumerate(sources.tolist()):
-        own = np.zeros((*grid.shape, 4))
+        cells = np.zeros((*grid.shape, 4))
         low_moments(
             returns.x_m, returns.y_m, scene.above_ground_m, returns.intensity, counted & (source == one), limits_m,
-            grid.corner, grid.cell_m, own,
+            grid.corner, grid.cell_m, cells,
         )  # fmt: skip
         for i in range(3):
-            sums[k, i] = sums_around(own[..., i], _POOLED)
+            sums[k, i] = sums_around(cells[..., i], _POOLED)
     return PassMoments(source, sources, sums)
 
 

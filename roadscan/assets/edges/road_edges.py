@@ -32,7 +32,7 @@ from roadscan.assets.edges.line_pieces import (
 )
 from roadscan.assets.edges.profiles import smooth_line
 from roadscan.assets.edges.steps import CELL_M, raster_of
-from roadscan.assets.edges.tracks import STATION_M, Track, tracks_of
+from roadscan.assets.edges.tracks import STATION_M, Parted, Track, tracks_of
 from roadscan.assets.scene import Scene, once_a_scene
 from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.compute.edges import EdgePath, counted, evidence_across, moved_cells, path_along
@@ -55,6 +55,8 @@ _BEHIND: Final = 3  # Cells where something stands; what is behind more of them 
 _SIGMA_M: Final = 0.008  # 1 σ of the height of a cell (m).
 _NEAR: Final = np.arange(-2, 3)
 """Cells about an edge's place that tell what it is, and whose returns saw it."""
+_BETWEEN: Final = 81
+"""Places between two drives, 0.1 m apart at the most, at which it is asked whether something stands there."""
 _BLOCK: Final = 20_000
 """Stations (10 km) whose edge is sought at once …"""
 _AROUND: Final = 60
@@ -121,7 +123,7 @@ def station_pieces(scene: Scene) -> pa.Table:
 def _stations_of(scene: Scene) -> _Stations | None:
     """Returns the same of all stations of a scene, places as its returns; None where there is none."""
     raster = raster_of(scene)
-    tracks = list(tracks_of(scene.drive_xyh_m)) if (raster.count > 0).any() else []
+    tracks = list(tracks_of(scene.drive_xyh_m, _parted_in(scene))) if (raster.count > 0).any() else []
     if not tracks:
         return None
     place = np.concatenate(
@@ -139,6 +141,22 @@ def _stations_of(scene: Scene) -> _Stations | None:
         np.minimum(returns, 255).astype(np.uint8), [list(one.passes) for one in seen],
         np.array([one.first_epoch_gps_ns for one in seen]), np.array([one.last_epoch_gps_ns for one in seen]),
     )  # fmt: skip
+
+
+def _parted_in(scene: Scene) -> Parted:
+    """Returns what tells whether a kerb, or something that stands, lies between two places of drives of a scene."""
+    raster, blocked = raster_of(scene), beside_of(scene).blocked
+    kerbs = shapely.STRtree([shapely.LineString(columns_of(edge)[:, :2]) for edge in free_edges(scene)])
+
+    def parted(places: Float64, others: Float64) -> Bool:
+        ways = shapely.linestrings(np.stack([places, others], axis=1))
+        found = np.zeros(len(places), np.bool_)
+        found[kerbs.query(ways, predicate="intersects")[0]] = True
+        share = np.linspace(0.0, 1.0, _BETWEEN)[:, None]
+        x, y = (places[:, k] + share * (others - places)[:, k] for k in (0, 1))
+        return np.asarray(found | blocked[raster.cells_of(x, y)].any(axis=0))
+
+    return parted
 
 
 def _across(track: Track, scene: Scene) -> tuple[Float64, Bool, Float64, Int64]:
@@ -298,10 +316,10 @@ def _path(up: Bool, evidence: npt.NDArray[np.uint8]) -> EdgePath:
     found = []
     for first in range(0, len(up), _BLOCK):
         begin = max(first - _AROUND, 0)
-        rows, own = slice(begin, first + _BLOCK + _AROUND), slice(first - begin, first - begin + _BLOCK)
+        rows, kept = slice(begin, first + _BLOCK + _AROUND), slice(first - begin, first - begin + _BLOCK)
         part = np.where(up[rows], _KERB, evidence[rows] / _STEPS)
         path = path_along(part, (STATION_M, CELL_M), within_m=_WITHIN_M)
-        found.append((path.cell[own], path.evidence[own]))
+        found.append((path.cell[kept], path.evidence[kept]))
     return EdgePath(*map(np.concatenate, zip(*found, strict=True)))
 
 

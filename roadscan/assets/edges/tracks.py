@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -35,8 +35,14 @@ class Track(NamedTuple):
     pass_id: int
 
 
-def tracks_of(drive_xyh_m: Float64) -> Iterator[Track]:
-    """Yields stations each half metre of each pass, where nothing drove beside it earlier, neither it nor another."""
+Parted = Callable[[Float64, Float64], Bool]
+
+
+def tracks_of(drive_xyh_m: Float64, parted: Parted | None = None) -> Iterator[Track]:
+    """Yields stations each half metre of each pass, where nothing drove beside it earlier, neither it nor another.
+
+    parted : whether something lies between places (n, 2) and (n, 2), so that they are on two roads; None: never.
+    """
     earlier = np.zeros((0, 2))
     for number in np.unique(drive_xyh_m[:, 3]):
         driven = drive_xyh_m[drive_xyh_m[:, 3] == number, :2]
@@ -44,7 +50,7 @@ def tracks_of(drive_xyh_m: Float64) -> Iterator[Track]:
         jumps = np.flatnonzero(np.hypot(*np.diff(driven, axis=0).T) > 5.0) + 1
         parts = [part for one in np.split(driven, jumps) if way_along(part := _moving(one))[-1] >= 2.0 * STATION_M]
         if parts:
-            yield from _stations(parts, earlier, int(number))
+            yield from _stations(parts, earlier, int(number), parted)
             earlier = np.concatenate([earlier, *parts])
 
 
@@ -57,7 +63,7 @@ def _moving(places: Float64) -> Float64:
     return np.asarray(places[np.hypot(*(last - first).T) >= _STRAIGHT * (ends[1] - ends[0])])
 
 
-def _stations(parts: list[Float64], earlier: Float64, number: int) -> Iterator[Track]:
+def _stations(parts: list[Float64], earlier: Float64, number: int, parted: Parted | None) -> Iterator[Track]:
     found = [stops(part, STATION_M, _LATTICE_M) for part in parts]
     headings = []
     for one in found:
@@ -66,27 +72,33 @@ def _stations(parts: list[Float64], earlier: Float64, number: int) -> Iterator[T
         headings.append(heading / np.maximum(np.hypot(*heading.T), 1e-9)[:, None])
     places, heading = np.concatenate(found), np.concatenate(headings)
     part = np.repeat(np.arange(len(found)), [len(one) for one in found])
-    free = ~_came_back(places, heading, part)
+    before = _came_from(places, heading, part)
     if len(earlier):
-        free &= scipy.spatial.cKDTree(earlier).query(places)[0] > SAME_ROAD_M
+        away, at = scipy.spatial.cKDTree(earlier).query(places)
+        before = np.where((away <= SAME_ROAD_M)[:, None], earlier[at], before)
+    free = np.isnan(before[:, 0])
+    if parted is not None:
+        free[~free] = parted(places[~free], before[~free])
     for first, end in runs_of(free):
         for rows in np.split(np.arange(first, end), np.flatnonzero(np.diff(part[first:end])) + 1):
             if len(rows) >= _FEWEST_STATIONS:
                 yield Track(places[rows], heading[rows], number)
 
 
-def _came_back(places: Float64, heading: Float64, part: Int64) -> Bool:
-    """Returns a mask (n,) of stations beside which the same pass drove before, there or back.
+def _came_from(places: Float64, heading: Float64, part: Int64) -> Float64:
+    """Returns the places (n, 2) beside stations that the same pass drove before, there or back; NaN where it did not.
 
     Before is what it drove until it last was out of reach of the station, or turned away from its heading. So neither
     a bend nor what is just behind counts, and nothing farther away does.
     """
-    came_back = np.zeros(len(places), np.bool_)
+    found = np.full((len(places), 2), np.nan)
     for k, some in enumerate(scipy.spatial.cKDTree(places).query_ball_point(places, SAME_ROAD_M, return_sorted=True)):
         near = np.array(some[: some.index(k)], np.int64)
         cosine = heading[near] @ heading[k]
         onward = near[(cosine >= 0.0) & (part[near] == part[k])][::-1]
         begun = k - np.count_nonzero(onward == k - 1 - np.arange(len(onward)))
         beside = np.abs((places[near] - places[k]) @ heading[k]) <= _BESIDE_M
-        came_back[k] = bool(np.any((near < begun) & beside & (np.abs(cosine) >= _PARALLEL)))
-    return came_back
+        same = near[(near < begun) & beside & (np.abs(cosine) >= _PARALLEL)]
+        if same.size:
+            found[k] = places[same[np.argmin(np.hypot(*(places[same] - places[k]).T))]]
+    return found

@@ -187,7 +187,7 @@ def _road_roughness_m(scene: Scene, moments: PassMoments, grid: CellGrid) -> flo
 
     def of_scene() -> Float64:
         road = _cells_with(scene, classes.ROAD, grid.corner, grid.shape)
-        return moments.scatter_m()[road & (moments.sums[:, 0].sum(axis=0) >= _LEAST_RETURNS)]
+        return np.asarray(moments.scatter_m()[road & (moments.sums[:, 0].sum(axis=0) >= _LEAST_RETURNS)])
 
     return scene.statistics.of("road_roughness_m", 0.5, of_scene)
 

@@ -37,7 +37,7 @@ class RoadEdge(AssetKind):
     curve: ClassVar[str] = "edges"
     options: ClassVar[type[Strict]] = RoadEdgeOptions
     reach_m: ClassVar[float] = REACH_M
-    """A square tells of its own stations, across which an edge is sought 14 m far, and of its kerbs."""
+    """A square tells of the stations in it, across which an edge is sought 14 m far, and of its kerbs."""
     piece_schema: ClassVar[pa.Schema] = STATION_PIECES
 
     def evidence(self, scene: Scene, options: Any) -> Evidence:

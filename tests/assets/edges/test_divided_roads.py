@@ -1,0 +1,97 @@
+"""Road edges of a kerbed road: of both carriageways beside a median, and across squares that count from two corners."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pytest
+import shapely
+from scipy.spatial import cKDTree
+
+from roadscan.assets.kinds.road_edge import RoadEdge, RoadEdgeOptions
+from roadscan.assets.make_scene import make_scene
+from roadscan.assets.scene import Box, Scene
+from tests.assets.edges.streets import returns_of
+from tests.assets.edges.test_cuts_of_edges import HALO_M, around
+
+Float64 = npt.NDArray[np.float64]
+KIND, KERB_M = RoadEdge(), 0.12
+
+
+def scene_of(box: Box, aside_m: Sequence[tuple[float, float]], drives: list[Float64], turn_rad: float = 0.0) -> Scene:
+    """Ground in a box with raised strips between two distances left of a line through its middle, seen with 6 mm noise.
+
+    turn_rad : of that line from the x axis. drives : places (k, 2) of each pass.
+    """
+    draw = np.random.default_rng(1)
+    x, y = (v.ravel() for v in np.meshgrid(np.arange(*box[::2], 0.07), np.arange(*box[1::2], 0.07)))
+    x, y = (v + draw.uniform(-0.03, 0.03, v.size) for v in (x, y))
+    middle = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2
+    aside = (y - middle[1]) * np.cos(turn_rad) - (x - middle[0]) * np.sin(turn_rad)
+    raised = np.any([(aside > low) & (aside < high) for low, high in aside_m], axis=0)
+    points = np.column_stack([x, y, 100.0 + KERB_M * raised + draw.normal(0.0, 0.006, x.size)])[
+        draw.random(x.size) < 0.6
+    ]
+    drive = np.concatenate([np.column_stack([d, np.full(len(d), 102.0), np.full(len(d), i + 1.0)])
+                            for i, d in enumerate(drives)])  # fmt: skip
+    near = cKDTree(drive[:, :2]).query(points[:, :2])[1]
+    sensor = np.column_stack([drive[near, :2], np.full(len(points), 102.0)])
+    returns = returns_of(points, np.full(len(points), 1e3), np.arange(len(points)), sensor, drive[near, 3])
+    window = around(box, 2.0)
+    return make_scene(returns, window, window, drive)
+
+
+def lines_of(scenes: list[Scene]) -> list[shapely.LineString]:
+    """Road edges, joined from the pieces of all scenes."""
+    options = RoadEdgeOptions()
+    pieces = pa.concat_tables([KIND.evidence(one, options).pieces for one in scenes])
+    return [shapely.force_2d(one.geometry) for one in KIND.objects(KIND.joined(pieces), options, {})]
+
+
+def straight(*corners: tuple[float, float]) -> Float64:
+    """Places (k, 2) each 0.3 m along a line through corners."""
+    return shapely.get_coordinates(shapely.segmentize(shapely.LineString(corners), 0.3))
+
+
+@pytest.mark.parametrize("is_one_pass", [True, False])
+@pytest.mark.parametrize(("median_m", "carriageway_m"), [(1.0, 3.5), (2.0, 5.0), (4.0, 3.5)])
+def test_both_carriageways_of_a_divided_road_have_their_edges(
+    median_m: float, carriageway_m: float, is_one_pass: bool
+) -> None:
+    inner, outer, middle = median_m / 2, median_m / 2 + carriageway_m, median_m / 2 + carriageway_m / 2
+    there, back = ((1.0, -middle), (56.0, -middle)), ((56.0, middle), (1.0, middle))
+    turn = [(56.0 + middle * np.cos(a), middle * np.sin(a)) for a in np.linspace(-1.4, 1.4, 15)]
+    drives = [straight(*there, *turn, *back)] if is_one_pass else [straight(*there), straight(*back)]
+    box = Box(0.0, -outer - 3.0, 60.0, outer + 3.0)
+    strips = [(-inner, inner), (outer, outer + 9.0), (-outer - 9.0, -outer)]
+    found = shapely.union_all(lines_of([scene_of(box, strips, drives)]))
+    for offset in (-outer, -inner, inner, outer):
+        places = np.column_stack([np.arange(3.0, 52.0, 0.5), np.full(98, offset)])
+        assert np.mean(shapely.distance(shapely.points(places), found) <= 0.25) >= 0.97, offset
+
+
+@pytest.mark.parametrize("turn_rad", [-0.28, -0.1, 0.03, 0.2])
+def test_an_edge_goes_on_where_the_border_of_squares_is_a_line_of_the_lattice(turn_rad: float) -> None:
+    """Stations lie on the border, and squares beside it count from corners 960 m apart."""
+    along = np.arange(-18.0, 18.0, 0.33)[:, None]
+    drive = np.array([960.03, 1000.0]) + along * [np.cos(turn_rad), np.sin(turn_rad)]
+    whole = scene_of(Box(940.0, 984.0, 980.0, 1016.0), [(4.0, 30.0), (-30.0, -4.0)], [drive], turn_rad)
+    parts = []
+    for first in (880.0, 960.0):
+        corner = np.array([960.0 * (first // 960.0), 960.0])
+        tile = Box(first, 960.0, first + 80.0, 1040.0)
+        window = around(tile, HALO_M)
+        some = whole.returns.at(window.holds(whole.returns.x_m, whole.returns.y_m))
+        returns = replace(
+            some, corner_m=(float(corner[0]), 960.0), x_m=some.x_m - corner[0], y_m=some.y_m - corner[1],
+            sensor_x_m=some.sensor_x_m - corner[0], sensor_y_m=some.sensor_y_m - corner[1],
+        )  # fmt: skip
+        shift = [*corner, *corner]
+        boxes = (Box(*(a - b for a, b in zip(one, shift, strict=True))) for one in (tile, window))
+        parts.append(make_scene(returns, *boxes, whole.drive_xyh_m - [*corner, 0.0, 0.0]))
+    lengths = [sorted(one.length for one in lines_of(some)) for some in ([whole], parts)]
+    assert len(lengths[0]) == 2 and np.allclose(*lengths, atol=0.01)

@@ -113,7 +113,7 @@ def found_edges(raster: HeightRaster, heights: Heights, settings: EdgeSettings =
 
 
 def _measured_runs(nodes: Nodes, evidence: Float64, lap: int, settings: EdgeSettings) -> list[Edge]:
-    """Returns runs of nodes with a measurable step; up to two nodes without are left inside a run."""
+    """Returns runs of nodes with a measurable step; up to four nodes without are left inside a run."""
     known = np.isfinite(nodes.sigma_step_m)
     low, high, scatter = (_medians_of_five(c, known) for c in (nodes.seen_low, nodes.seen_high_m, nodes.scatter_m))
     good = known & (nodes.step_m >= settings.least_step_m) & (low >= settings.seen_low)

@@ -10,6 +10,7 @@ import pytest
 import shapely
 
 from roadscan.assets.edges.beside import BESIDE_PIECES
+from roadscan.assets.edges.road_edges import EDGE_LINES
 from roadscan.assets.green import colours
 from roadscan.assets.green.areas import GREEN_CELLS, Sums, green_rows, mosaic_of
 from roadscan.assets.green.cells import CELL_M, ground_cells
@@ -200,10 +201,10 @@ def rest() -> dict:
 
 def test_a_verge_is_moved_to_the_lawn_and_a_kerb_is_not() -> None:
     kind = RoadEdge()
-    names = [f.name for f in kind.piece_schema if pa.types.is_list(f.type) and f.name != "passes"]
+    names = [f.name for f in EDGE_LINES if pa.types.is_list(f.type) and f.name != "passes"]
     rows = [line_at(2.8, names, sigma_m=0.15) | rest(), line_at(2.8, names, sigma_m=0.02, by_kerb=1.0) | rest(),
             line_at(1.5, names, sigma_m=0.15) | rest()]  # fmt: skip
-    pieces = pa.Table.from_pylist(rows, schema=kind.piece_schema)
+    pieces = pa.Table.from_pylist(rows, schema=EDGE_LINES)
     verge, kerb, far = kind.with_pictures(pieces, green_of([(look(), 0), (look(), 1)])).to_pylist()
     assert np.array(verge["easting_m"]) == pytest.approx(EDGE_M, abs=FINE_M)
     assert max(verge["sigma_m"]) < 0.08

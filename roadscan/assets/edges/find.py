@@ -107,8 +107,8 @@ def found_edges(raster: HeightRaster, heights: Heights, settings: EdgeSettings =
     parts: list[Edge] = []
     for chain in paths_of(step_places(raster)):
         line, lap = profiles.chain_line(chain)
-        nodes = profiles.nodes_of(line, heights, raster, slopes, profiles.near_places(line, chain))
-        parts += _measured_runs(nodes, profiles.evidence_at(line, chain), lap, settings)
+        near, evidence = profiles.places_along(line, chain)
+        parts += _measured_runs(profiles.nodes_of(line, heights, raster, slopes, near), evidence, lap, settings)
     return _bridged(parts, heights, raster, slopes, settings)
 
 
@@ -262,10 +262,7 @@ def node_features(scene: Scene, edges: Sequence[Edge]) -> dict[str, Float64]:
     # Of equal nodes of several laps one stands for all.
     lap = [np.arange(len(e.seen)) % e.lap if e.lap else np.arange(len(e.seen)) for e in edges]
     one, again = np.unique(np.concatenate([k.start + at for k, at in zip(rows, lap, strict=True)]), return_inverse=True)
-    raster = raster_of(scene)
-    near = np.flatnonzero(raster.used & _near(place[one], raster)[np.maximum(raster.cell, 0)])
-    of_returns = _of_returns(scene, place[one])
-    of_returns["within_rings"] = share_within_rings(scene.returns, near, place[one], np.where(seen, step, np.nan)[one])
+    of_returns = _of_returns(scene, place[one], np.where(seen, step, np.nan)[one])
     measured = {
         "seen_low": seen_low, "covered": covered,
         "significance": np.minimum(step / np.hypot(sigma, _LEAST_SIGMA_M), _MOST_RATIO),
@@ -293,13 +290,15 @@ def _medians_of_known(values: Float64) -> Float64:
     return np.where(known > 0, 0.5 * (low + high), np.nan)
 
 
-def _of_returns(scene: Scene, place: Float64) -> dict[str, Float64]:
-    """Returns features (n,) of the returns beside each node: shares that stand and that grow by side, and `crossing`.
+def _of_returns(scene: Scene, place: Float64, step_m: Float64) -> dict[str, Float64]:
+    """Returns features (n,) of the returns beside each node: shares that stand and that grow by side, `crossing` and
+    `within_rings`, the share of the step (n,) that single rings show.
 
     `crossing` is the mean cosine between beams and the edge: 0 where the edge lies along the ring that a laser draws.
     """
     raster, returns, count = raster_of(scene), scene.returns, len(place)
     rows = np.flatnonzero(_near(place, raster)[np.maximum(raster.cell, 0)] & (raster.cell >= 0))
+    within_rings = share_within_rings(returns, rows[raster.used[rows]], place, step_m)
     away, owner = scipy.spatial.cKDTree(place[:, :2]).query(
         np.column_stack([returns.x_m[rows], returns.y_m[rows]]), distance_upper_bound=_BESIDE_M
     )
@@ -323,7 +322,7 @@ def _of_returns(scene: Scene, place: Float64) -> dict[str, Float64]:
     return {
         **{f"{name}_{side}": share(of, own) for name, of in (("stands", _STANDING_M), ("grows", _PLANTS_M))
            for side, own in sides.items()},
-        "crossing": np.where(number > 0, total / np.maximum(number, 1), np.nan),
+        "crossing": np.where(number > 0, total / np.maximum(number, 1), np.nan), "within_rings": within_rings,
     }  # fmt: skip
 
 

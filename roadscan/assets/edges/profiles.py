@@ -263,21 +263,19 @@ def runs_along(flags: Bool, lap: int) -> list[Int64]:
     return [lap + rows % lap for rows in runs]
 
 
-def evidence_at(line: Float64, chain: Chain) -> Float64:
-    """Returns the evidence (n,) (σ · m) of a chain's places about each of the points (n, 2) along it."""
+def places_along(line: Float64, chain: Chain) -> tuple[Bool, Float64]:
+    """Returns which points (n, 2) along a chain lie at one of its places, not in a gap, and the evidence (σ · m) of
+    the places about each.
+    """
     places = np.column_stack(chain.places[:2])
+    away, nearest = scipy.spatial.cKDTree(places).query(line)
     total = np.append(0.0, np.cumsum(chain.gains))
-    at = total[scipy.spatial.cKDTree(places).query(line)[1]]
+    at = total[nearest]
     if chain.closed:
         at = np.unwrap(at, period=total[-1])
     middles = 0.5 * (at[1:] + at[:-1])
-    return np.diff(np.concatenate([at[:1], middles, at[-1:]] if chain.closed else [total[:1], middles, total[-1:]]))
-
-
-def near_places(line: Float64, chain: Chain) -> Bool:
-    """Returns a mask of the points (n, 2) along a chain that lie at one of its places, not in a gap between two."""
-    places = np.column_stack(chain.places[:2])
-    return np.asarray(scipy.spatial.cKDTree(places).query(line)[0] <= FREE_M)
+    ends = (at[:1], at[-1:]) if chain.closed else (total[:1], total[-1:])
+    return away <= FREE_M, np.diff(np.concatenate([ends[0], middles, ends[1]]))
 
 
 def nodes_of(

@@ -122,8 +122,7 @@ def station_pieces(scene: Scene) -> pa.Table:
 @once_a_scene
 def _stations_of(scene: Scene) -> _Stations | None:
     """Returns the same of all stations of a scene, places as its returns; None where there is none."""
-    raster = raster_of(scene)
-    tracks = list(tracks_of(scene.drive_xyh_m, _parted_in(scene))) if (raster.count > 0).any() else []
+    tracks = _tracks_in(scene)
     if not tracks:
         return None
     place = np.concatenate(
@@ -141,6 +140,12 @@ def _stations_of(scene: Scene) -> _Stations | None:
         np.minimum(returns, 255).astype(np.uint8), [list(one.passes) for one in seen],
         np.array([one.first_epoch_gps_ns for one in seen]), np.array([one.last_epoch_gps_ns for one in seen]),
     )  # fmt: skip
+
+
+@once_a_scene
+def _tracks_in(scene: Scene) -> list[Track]:
+    """Returns the stations of a scene that road edges are sought from; none where it has no ground."""
+    return list(tracks_of(scene.drive_xyh_m, _parted_in(scene))) if (raster_of(scene).count > 0).any() else []
 
 
 def _parted_in(scene: Scene) -> Parted:
@@ -200,7 +205,7 @@ def _across(track: Track, scene: Scene) -> tuple[Float64, Bool, Float64, Int64]:
 def places_across(scene: Scene) -> Float64:
     """Returns places (n, 2) each metre across the stations of a scene: a road edge lies near some of them."""
     offset = np.arange(-FARTHEST_M, FARTHEST_M + 0.5, 1.0)[:, None]
-    some = [t.places[:, None] + offset * _right_of(t.heading)[:, None] for t in tracks_of(scene.drive_xyh_m)]
+    some = [t.places[:, None] + offset * _right_of(t.heading)[:, None] for t in _tracks_in(scene)]
     return np.concatenate([np.zeros((0, 2)), *(one.reshape(-1, 2) for one in some)])
 
 

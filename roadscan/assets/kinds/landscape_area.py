@@ -102,19 +102,18 @@ def grown_cells(scene: Scene, options: LandscapeOptions) -> pa.Table:
     if even is None:
         return PIECE_SCHEMA.empty_table()
     above = heights_of_one_pass_m(scene, flat, moments, options.rough_ratio * even, grid)
-    sums = _sums(scene, above, flat, corner, shape)
+    off = np.abs(above) > options.rough_ratio * even
+    sums = _sums(scene, above, flat, grid, off.astype(np.float32))
     counted, rough = _roughness(sums)
     ratio = rough / even
     wall = _cells_with(scene, classes.BUILDING, corner, shape, _WALL_M).view(np.uint8)
     wall = cv2.dilate(wall, _POOLED, iterations=2) > 0
     is_rough = counted & (ratio >= options.rough_ratio) & ~wall
     wide = _wide_ones(is_rough, (counted & ~is_rough) | wall, counted)
-    off = np.abs(above) > options.rough_ratio * even
-    share = _sums(scene, above, flat, corner, shape, off.astype(np.float32))[..., 3]
     driven = (scene.classes == classes.ROAD).astype(np.float32)
-    every = _sums(scene, above, np.ones(flat.size, np.bool_), corner, shape, driven)
+    every = _sums(scene, above, np.ones(flat.size, np.bool_), grid, driven)
     is_road = counted & (every[..., 3] >= _MOST * every[..., 0])
-    grown = _up_to_edge(wide, is_rough, counted & ~is_rough & ~wall, sums[..., 0], share) & ~is_road
+    grown = _up_to_edge(wide, is_rough, counted & ~is_rough & ~wall, sums[..., 0], sums[..., 3]) & ~is_road
     unseen = sums[..., 0] == 0
     grown = grown | (_closed(grown) & wide & unseen)
     inside = np.zeros(shape, np.bool_)
@@ -215,19 +214,10 @@ def _flat_ones(scene: Scene) -> Bool:
     return counted
 
 
-def _sums(
-    scene: Scene,
-    above_m: Float32,
-    counted: Bool,
-    corner: Float64,
-    shape: tuple[int, int],
-    values: Float32 | None = None,
-) -> Float64:
+def _sums(scene: Scene, above_m: Float32, counted: Bool, grid: CellGrid, values: Float32) -> Float64:
     """Returns sums (rows, columns, 4) over the low returns of cells that count: n, Σh, Σh², and Σ of values (n,)."""
-    returns = scene.returns
-    sums = np.zeros((*shape, 4))
-    values = returns.intensity if values is None else values
-    low_moments(returns.x_m, returns.y_m, above_m, values, counted, np.array(_LOW_M), corner, CELL_M, sums)
+    sums, limits = np.zeros((*grid.shape, 4)), np.array(_LOW_M)
+    low_moments(scene.returns.x_m, scene.returns.y_m, above_m, values, counted, limits, grid.corner, grid.cell_m, sums)
     return sums
 
 

@@ -385,10 +385,15 @@ def strips_of(line: Line, usable: Bool, least_m: float, shortest_m: float) -> It
 
     least_m : least width of the surface behind the line (m).
     """
-    width = line.column("width_m")
-    at = np.flatnonzero(usable & np.isfinite(width))
+    usable = usable & np.isfinite(line.column("width_m"))
+    at = np.flatnonzero(usable)
     if at.size < 2:
         return
+    if at[0] > 0 and np.array_equal(line.nodes[0, :2], line.nodes[-1, :2]):
+        # A closed line begins where it is usable, so that no strip ends where it began.
+        rows = np.append(np.arange(at[0], len(usable)), np.arange(1, at[0] + 1))
+        line, at = Line(line.nodes[rows], line.seen_by, line.names), np.flatnonzero(usable[rows])
+    width = line.column("width_m")
     level = scipy.ndimage.median_filter(width[at], MEDIAN_NODES, mode="nearest")
     smooth = np.interp(np.arange(len(width)), at, level)
     known = np.zeros(len(width), np.bool_)

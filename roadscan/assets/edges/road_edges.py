@@ -30,6 +30,7 @@ from roadscan.assets.edges.line_pieces import (
     line_schema,
     lines_table,
 )
+from roadscan.assets.edges.once import FEWEST, FoundEdge, each_once
 from roadscan.assets.edges.profiles import smooth_line
 from roadscan.assets.edges.steps import CELL_M, raster_of
 from roadscan.assets.edges.tracks import STATION_M, Parted, Track, tracks_of
@@ -47,7 +48,6 @@ _ROUND_M: Final = 3.0
 _KERB: Final = 6.0  # Evidence of a cell at a kerb.
 _BARRIER: Final = 3.0  # Evidence of a cell where something stands.
 _LEAST: Final = 0.6  # Least evidence of an edge at a station.
-_FEWEST: Final = 5  # Stations of an edge.
 _AT_KERB_M: Final = 0.4  # An edge so near to its kerb (m) lies on it.
 _INSIDE_M: Final = (0.45, 0.95)
 """The height of an edge follows from the road this far inside it (m, from and to)."""
@@ -238,14 +238,27 @@ def edge_lines(pieces: pa.Table) -> pa.Table:
         kerbs = columns.pop("kerbs")
         stations = _Stations(**columns)
         segments = shapely.STRtree(shapely.linestrings(kerbs.reshape(-1, 2, 2)))
+        found = []
         for chain in _chains(stations):
             some = _Stations._make(
                 [column[k] for k in chain.tolist()] if isinstance(column, list) else column[chain]
                 for column in stations
             )
             for right in (False, True):
-                rows += _one_side(some, right, kerbs, segments)
+                found += [e._replace(rows=chain[e.rows]) for e in _one_side(some, right, kerbs, segments)]
+        rows = [_with_seen(edge, stations) for edge in each_once(found)]
     return lines_table([CutEdge(nodes, False, False) for nodes, _ in rows], [seen for _, seen in rows], EDGE_LINES)
+
+
+def _with_seen(edge: FoundEdge, stations: _Stations) -> tuple[Float64, Seen]:
+    """Returns the nodes of an edge, closed where it leads round, and what saw it."""
+    lap = _lap(edge.nodes[:, :2])
+    nodes = closed_nodes(edge.nodes[:lap]) if lap else edge.nodes
+    passes = sorted({one for k in edge.rows.tolist() for one in stations.passes[k]})
+    return nodes, Seen(
+        int(edge.returns.sum()), tuple(passes), int(stations.first_epoch_gps_ns[edge.rows].min()),
+        int(stations.last_epoch_gps_ns[edge.rows].max()),
+    )  # fmt: skip
 
 
 def _stacked(pieces: pa.Table, name: str) -> Any:
@@ -276,10 +289,8 @@ def _chains(stations: _Stations) -> Iterator[Int64]:
         yield np.array(chain, np.int64)
 
 
-def _one_side(
-    some: _Stations, right: bool, kerbs: Float64, segments: shapely.STRtree
-) -> Iterator[tuple[Float64, Seen]]:
-    """Yields the nodes (n, `EDGE_COLUMNS`) of one side's edges along a chain of stations, and what saw them."""
+def _one_side(some: _Stations, right: bool, kerbs: Float64, segments: shapely.STRtree) -> Iterator[FoundEdge]:
+    """Yields one side's edges along a chain of stations, with the columns `EDGE_COLUMNS`."""
     out = _right_of(some.place[:, 2:4]) * (1.0 if right else -1.0)
     side = int(right)
     up = _kerbs_across(some.place[:, :2], out, kerbs, segments)
@@ -304,13 +315,7 @@ def _one_side(
         nodes[:, -4:] = np.column_stack(
             [by_kerb[rows], by_barrier[rows], np.full(len(rows), float(right)), found.evidence[rows]]
         )
-        lap = _lap(line)
-        nodes = closed_nodes(nodes[:lap]) if lap else nodes
-        passes = sorted({one for k in rows.tolist() for one in some.passes[k]})
-        yield nodes, Seen(
-            int(returns[rows].sum()), tuple(passes), int(some.first_epoch_gps_ns[rows].min()),
-            int(some.last_epoch_gps_ns[rows].max()),
-        )  # fmt: skip
+        yield FoundEdge(nodes, rows, returns[rows], out[rows], offset)
 
 
 def _path(up: Bool, evidence: npt.NDArray[np.uint8]) -> EdgePath:
@@ -330,7 +335,7 @@ def _path(up: Bool, evidence: npt.NDArray[np.uint8]) -> EdgePath:
 
 def _lap(line: Float64) -> int:
     """Returns how many nodes of a line (n, 2) lead round to its beginning; 0 where it does not lead there."""
-    from_first, first, last = line - line[0], line[_FEWEST - 1] - line[0], line[-1] - line[-_FEWEST]
+    from_first, first, last = line - line[0], line[FEWEST - 1] - line[0], line[-1] - line[-FEWEST]
     near = np.hypot(*from_first.T) <= _ROUND_M
     if not near[-1] or first @ last <= 0.0:
         return 0
@@ -360,7 +365,7 @@ def _runs(good: Bool, cell: Int64, moved: int) -> Iterator[Int64]:
     begins = np.append(True, np.abs(np.diff(cell)) > moved) | ~good
     for rows in np.split(np.arange(good.size), np.flatnonzero(begins)[1:]):
         kept = rows[good[rows]]
-        if len(kept) >= _FEWEST:
+        if len(kept) >= FEWEST:
             yield kept
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -12,6 +13,7 @@ import pytest
 import shapely
 from scipy.spatial import cKDTree
 
+from roadscan.assets.edges.once import FoundEdge, each_once
 from roadscan.assets.kinds.road_edge import RoadEdge, RoadEdgeOptions
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.scene import Box, Scene
@@ -95,3 +97,46 @@ def test_an_edge_goes_on_where_the_border_of_squares_is_a_line_of_the_lattice(tu
         parts.append(make_scene(returns, *boxes, whole.drive_xyh_m - [*corner, 0.0, 0.0]))
     lengths = [sorted(one.length for one in lines_of(some)) for some in ([whole], parts)]
     assert len(lengths[0]) == 2 and np.allclose(*lengths, atol=0.01)
+
+
+def times_seen(lines: list[shapely.LineString], offset_m: float) -> npt.NDArray[np.int64]:
+    """How many lines lie within 0.25 m of places each half metre along a street, at an offset."""
+    places = shapely.points(np.column_stack([np.arange(3.0, 52.0, 0.5), np.full(98, offset_m)]))
+    return np.sum([shapely.distance(places, one) <= 0.25 for one in lines], axis=0)
+
+
+@pytest.mark.parametrize("is_one_pass", [True, False])
+def test_each_kerb_of_a_wide_street_driven_in_its_outer_lanes_is_one_edge(is_one_pass: bool) -> None:
+    """There and back, 10.5 m apart with nothing between: both see both kerbs."""
+    there, back = ((1.0, -5.25), (56.0, -5.25)), ((56.0, 5.25), (1.0, 5.25))
+    turn = [(56.0 + 5.25 * np.cos(a), 5.25 * np.sin(a)) for a in np.linspace(-1.4, 1.4, 15)]
+    drives = [straight(*there, *turn, *back)] if is_one_pass else [straight(*there), straight(*back)]
+    found = lines_of([scene_of(Box(0.0, -10.0, 64.0, 10.0), [(7.0, 20.0), (-20.0, -7.0)], drives)])
+    for offset in (-7.0, 7.0):
+        assert np.mean(times_seen(found, offset) == 1) >= 0.97, offset
+
+
+def along_x(first_m: float, last_m: float, northing_m: float, offset_m: float, is_left: bool = True) -> FoundEdge:
+    """An edge along the x axis with a node each half metre, left or right of a drive so far from it."""
+    x = np.arange(first_m, last_m + 0.1, 0.5)
+    nodes = np.column_stack([x, np.full(x.size, northing_m), np.full(x.size, 100.0)])
+    out = np.tile([0.0, 1.0 if is_left else -1.0], (x.size, 1))
+    return FoundEdge(nodes, np.arange(x.size), np.ones(x.size, np.int64), out, np.full(x.size, offset_m))
+
+
+def test_of_edges_on_one_another_that_of_the_nearest_drive_is_left() -> None:
+    """Three of one kerb, one of them beside half of it; the other side of a thin barrier; a bridge above; a crossing.
+
+    Their order changes nothing.
+    """
+    far, near, middle = along_x(0.0, 60.0, 0.0, 9.0), along_x(20.0, 40.0, 0.1, 2.0), along_x(0.0, 60.0, -0.1, 5.0)
+    behind, above = along_x(0.0, 60.0, 0.1, 4.0, is_left=False), along_x(0.0, 60.0, 0.0, 9.5)
+    above.nodes[:, 2] += 6.0
+    across = along_x(-20.0, 20.0, 0.0, 9.9)
+    across.nodes[:, :2] = across.nodes[:, 1::-1] + [30.0, 0.0]
+    edges = [far, near, middle, behind, above, across]
+    for order in itertools.permutations(range(6)):
+        found = each_once([edges[k] for k in order])
+        kept = sorted((float(e.offset_m[0]), *e.nodes[[0, -1], 0].tolist()) for e in found)
+        assert kept == [(2.0, 20.0, 40.0), (4.0, 0.0, 60.0), (5.0, 0.0, 20.0), (5.0, 40.0, 60.0), (9.5, 0.0, 60.0),
+                        (9.9, 30.0, 30.0)]  # fmt: skip

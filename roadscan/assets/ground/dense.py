@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.bins import cells_of
+from roadscan.assets.ground.mirror_images import lowest_without_mirror_images
 from roadscan.assets.ground.surface import Found, Grid, Place, Surface, bare_cells, filled, grid_over, without_pits
 from roadscan.assets.kernels.ground import cell_heights, on_ground, scatter
-from roadscan.assets.kernels.low_returns import lowest_returns
 from roadscan.assets.scene import Returns, Statistics
 from roadscan.compute.array_types import Bool, Float32
 from roadscan.core.extras import cv2
@@ -149,8 +149,7 @@ def dense_ground(place: Place) -> Found:
     returns = place.returns
     x, y, z = returns.x_m, returns.y_m, returns.height_m
     grid = grid_over(place.window, LOWEST_CELL_M)
-    lowest = np.full(grid.shape, np.inf, np.float32)
-    lowest_returns(x, y, z, grid.origin, 1.0 / grid.cell_m, lowest)
+    lowest = lowest_without_mirror_images(returns, grid, place.settings.steepest)
     surface, known = without_pits(lowest, _PIT_M, grid)
     known &= bare_cells(surface, grid.cell_m, place.settings)
     base = Surface(grid, filled(lowest, known, grid))

@@ -37,6 +37,7 @@ from roadscan.assets.edges.steps import CELL_M, raster_of
 from roadscan.assets.edges.tracks import STATION_M, Parted, Track, bridged, tracks_of, unbroken
 from roadscan.assets.scene import Scene, once_a_scene
 from roadscan.compute.array_types import Bool, Float64, Int64
+from roadscan.compute.arrays import way_along
 from roadscan.compute.edges import EdgePath, counted, evidence_across, moved_cells, path_along
 
 NEAREST_M: Final = 0.8  # Edges are sought from this distance to the drive (m) …
@@ -49,6 +50,7 @@ _ROUND_M: Final = 3.0
 _KERB: Final = 6.0  # Evidence of a cell at a kerb.
 _BARRIER: Final = 3.0  # Evidence of a cell where something stands.
 _LEAST: Final = 0.6  # Least evidence of an edge at a station.
+_HOLE_M: Final = 10.0  # A longer hole of an edge (m) is none of it: evidence of a station is its mean over that.
 _AT_KERB_M: Final = 0.4  # An edge so near to its kerb (m) lies on it.
 _INSIDE_M: Final = (0.45, 0.95)
 """The height of an edge follows from the road this far inside it (m, from and to)."""
@@ -316,7 +318,9 @@ def _one_side(some: _Stations, right: bool, kerbs: Float64, segments: shapely.ST
     side = int(right)
     up = _kerbs_across(some.place[:, :2], out, kerbs, segments)
     hidden = _behind_parting((up | (some.stands[:, side] > 0)), some.driven[:, side])
-    found = _path(up & ~hidden, np.where(hidden, 0, some.evidence[:, side]).astype(np.uint8))
+    evidence = np.where(hidden, 0, some.evidence[:, side]).astype(np.uint8)
+    up &= ~hidden
+    found = _path(up, evidence)
     near = np.clip(found.cell[:, None] + _NEAR, 0, _OFFSETS.size - 1)
     by_kerb, by_barrier = (
         scipy.ndimage.median_filter(np.take_along_axis(shown, near, axis=1).any(axis=1).astype(np.float64), 5)
@@ -324,7 +328,9 @@ def _one_side(some: _Stations, right: bool, kerbs: Float64, segments: shapely.ST
     )
     lines = some.place[:, :2] + _OFFSETS[found.cell, None] * out
     returns = np.take_along_axis(some.returns[:, side], near, axis=1).sum(axis=1)
-    for rows in _runs(found.evidence.round(6) >= _LEAST, found.cell, moved_cells(CELL_M)):
+    shown = np.where(up, _KERB, evidence)[np.arange(len(up)), found.cell] > 0.0
+    good = (found.evidence.round(6) >= _LEAST) & _with_holes(shown, lines)
+    for rows in _runs(good, found.cell, moved_cells(CELL_M)):
         line = _snapped(smooth_line(lines[rows], np.ones(len(rows))), by_kerb[rows] > 0.5, segments)
         offset = ((line - some.place[rows, :2]) * out[rows]).sum(axis=1)
         cell = np.clip(np.rint((offset - NEAREST_M) / CELL_M).astype(np.int64), 0, _OFFSETS.size - 1)
@@ -395,6 +401,20 @@ def _kerbs_across(places: Float64, out: Float64, kerbs: Float64, segments: shape
     cell = np.clip(np.floor((offset - NEAREST_M) / CELL_M).astype(np.int64), 0, _OFFSETS.size - 1)
     up[at, cell] = up[at, cell + 1] = True
     return up[:, :-1]
+
+
+def _with_holes(shown: Bool, lines: Float64) -> Bool:
+    """Returns a mask (n,) of the stations that show an edge, and of holes between them: an edge does not end in one.
+
+    lines : (n, 2) its places. So an edge does not go on over bare asphalt where a drive turns, however short its way.
+    """
+    at = np.flatnonzero(shown & (np.convolve(shown, np.ones(_NEAR.size), "same") > 1.5))  # a lone one is chance
+    if not at.size:
+        return np.zeros(len(shown), np.bool_)
+    after = np.searchsorted(at, np.arange(len(shown)))
+    ends = way_along(lines)[at]
+    narrow = np.concatenate([[False], np.diff(ends) <= _HOLE_M, [False]])
+    return np.asarray(np.isin(np.arange(len(shown)), at) | narrow[after])
 
 
 def _runs(good: Bool, cell: Int64, moved: int) -> Iterator[Int64]:

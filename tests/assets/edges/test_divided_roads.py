@@ -119,13 +119,14 @@ def times_seen(lines: list[shapely.LineString], offset_m: float) -> npt.NDArray[
 
 @pytest.mark.parametrize("is_one_pass", [True, False])
 def test_each_kerb_of_a_wide_street_driven_in_its_outer_lanes_is_one_edge(is_one_pass: bool) -> None:
-    """There and back, 10.5 m apart with nothing between: both see both kerbs."""
+    """There and back, 10.5 m apart with nothing between: both see both kerbs. Where it turns there is bare asphalt."""
     there, back = ((1.0, -5.25), (56.0, -5.25)), ((56.0, 5.25), (1.0, 5.25))
     turn = [(56.0 + 5.25 * np.cos(a), 5.25 * np.sin(a)) for a in np.linspace(-1.4, 1.4, 15)]
     drives = [straight(*there, *turn, *back)] if is_one_pass else [straight(*there), straight(*back)]
     found = lines_of([scene_of(Box(0.0, -10.0, 64.0, 10.0), [(7.0, 20.0), (-20.0, -7.0)], drives)])
     for offset in (-7.0, 7.0):
         assert np.mean(times_seen(found, offset) == 1) >= 0.97, offset
+    assert np.abs(np.abs(shapely.get_coordinates(found)[:, 1]) - 7.0).max() <= 0.25
 
 
 def halves(scene: Scene) -> list[Scene]:

@@ -408,9 +408,8 @@ def _with_holes(shown: Bool, lines: Float64) -> Bool:
 
     lines : (n, 2) its places. So an edge does not go on over bare asphalt where a drive turns, however short its way.
     """
-    at = np.flatnonzero(shown & (np.convolve(shown, np.ones(_NEAR.size), "same") > 1.5))  # a lone one is chance
-    if not at.size:
-        return np.zeros(len(shown), np.bool_)
+    beside = scipy.ndimage.convolve1d(shown.astype(np.float64), np.ones(FEWEST), mode="constant")
+    at = np.flatnonzero(shown & (beside > 1.5))  # a lone one is chance
     after = np.searchsorted(at, np.arange(len(shown)))
     ends = way_along(lines)[at]
     narrow = np.concatenate([[False], np.diff(ends) <= _HOLE_M, [False]])

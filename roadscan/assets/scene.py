@@ -21,6 +21,8 @@ from roadscan.compute.kernel_options import read_only
 LINES_M: Final = 30.0
 """Sight lines that end farther from a thing than this (m) do not tell what stands there: squares are searched with what
 lies so far around them, since bare earth reads farther."""
+SAME_LEVEL_M: Final = 1.5
+"""Heights of one road differ by less in one place (m): roads over one another are 3 m or more apart."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,13 +234,17 @@ class Scene:
     classes: npt.NDArray[np.uint8]
     """(n,) class of each return (:mod:`roadscan.assets.classes`): ground, vegetation, building, vehicle, person …"""
     drive_xyh_m: Float64
-    """(p, 4) the drives through the window: x, y, height of the sensor, and the pass, in the order of time."""
+    """(p, 4) the drives through the window on the ground: x, y, height of the sensor, and the pass, in the order of
+    time."""
     statistics: Statistics = field(default_factory=Statistics)
     whole: Scene | None = None
     """The scene of several tiles together that this one is a view of, with its own tile; None: it is none."""
     beyond_m: Float64 = field(default_factory=lambda: np.zeros((6, 0)))
     """(6, k) sight lines that end up to :data:`LINES_M` outside of the window: x, y, height of the sensor and of the
     return."""
+    hidden_xyh_m: Float64 = field(default_factory=lambda: np.zeros((0, 4)))
+    """(l, 4) places of the drives where the ground is another level: x, y, height of their road (NaN where it is not
+    known), and the pass."""
 
     def of_tile(self, tile: Box) -> Scene:
         """Returns the same scene for one of its tiles: what does not depend on the tile is computed once for all."""

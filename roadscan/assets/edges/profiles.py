@@ -365,9 +365,11 @@ def even_nodes(places: Float64, distance_m: float) -> Float64:
 
 
 def stops(places: Float64, distance_m: float, lattice_m: float) -> Float64:
-    """Returns points (k, 2) along places (n, 2): both ends, crossings of a lattice of the map, even ones between."""
+    """Returns points (k, …) along places (n, …), x and y first: both ends, crossings of a lattice of the map, even ones
+    between.
+    """
     length, fixed = way_along(places), []
-    for at in places.T / lattice_m:
+    for at in places.T[:2] / lattice_m:
         cell = np.floor(at)
         k = np.flatnonzero(np.diff(cell))
         share = (np.maximum(cell[k], cell[k + 1]) - at[k]) / (at[k + 1] - at[k])
@@ -379,7 +381,7 @@ def stops(places: Float64, distance_m: float, lattice_m: float) -> Float64:
     counts = np.maximum(np.rint(np.diff(ends) / distance_m).astype(np.int64), 1)
     parts = [np.linspace(*part, n, endpoint=False) for part, n in zip(itertools.pairwise(ends), counts, strict=True)]
     stops = np.concatenate([*parts, ends[-1:]])
-    return np.column_stack([np.interp(stops, length, places[:, i]) for i in range(2)])
+    return np.column_stack([np.interp(stops, length, places[:, i]) for i in range(places.shape[1])])
 
 
 def headings(x_m: Float64, y_m: Float64) -> tuple[Float64, Float64]:

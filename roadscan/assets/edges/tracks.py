@@ -17,7 +17,9 @@ STATION_M: Final = 0.5  # Distance of stations along the drive (m).
 _LATTICE_M: Final = 3.0
 """Stations lie where the drive crosses a lattice of this edge (m), and evenly between: wherever it enters a scene."""
 SAME_ROAD_M: Final = 8.0
-"""A drive this near (m) to an earlier one is on the same road: its edges are found from the earlier."""
+"""A drive this near (m) to an earlier one is on the same road: its edges are found from the earlier …"""
+_SAME_LEVEL_M: Final = 2.5
+"""… where it is as high: sensors of two vehicles differ by less (m), roads over one another by 3 m or more."""
 _BESIDE_M: Final = 0.6
 """What a pass drove earlier lies beside a station, not before or behind it, if it is this near along (m) …"""
 _PARALLEL: Final = 0.7
@@ -45,9 +47,9 @@ def tracks_of(drive_xyh_m: Float64, parted: Parted | None = None) -> Iterator[Tr
 
     parted : whether something lies between places (n, 2) and (n, 2), so that they are on two roads; None: never.
     """
-    earlier = np.zeros((0, 2))
+    earlier = np.zeros((0, 3))
     for number in np.unique(drive_xyh_m[:, 3]):
-        driven = drive_xyh_m[drive_xyh_m[:, 3] == number, :2]
+        driven = drive_xyh_m[drive_xyh_m[:, 3] == number, :3]
         parts = [part for one in unbroken(driven) if way_along(part := _moving(one))[-1] >= 2.0 * STATION_M]
         if parts:
             yield from _stations(parts, earlier, int(number), parted)
@@ -55,8 +57,8 @@ def tracks_of(drive_xyh_m: Float64, parted: Parted | None = None) -> Iterator[Tr
 
 
 def unbroken(driven: Float64) -> list[Float64]:
-    """Returns the parts of a drive (k, 2) between jumps: there it left the window, or nobody knows where it was."""
-    return np.split(driven, np.flatnonzero(np.hypot(*np.diff(driven, axis=0).T) > 5.0) + 1)
+    """Returns the parts of a drive (k, …) between jumps: there it left the window, or nobody knows where it was."""
+    return np.split(driven, np.flatnonzero(np.hypot(*np.diff(driven[:, :2], axis=0).T) > 5.0) + 1)
 
 
 def bridged(parts: Bool) -> Bool:
@@ -66,8 +68,8 @@ def bridged(parts: Bool) -> Bool:
 
 
 def _moving(places: Float64) -> Float64:
-    """Returns the places (k, 2) of a drive without those where it stands: there it does not come away."""
-    places = places[np.append(True, np.hypot(*np.diff(places, axis=0).T) > 0.0)]
+    """Returns the places (k, 3) of a drive without those where it stands: there it does not come away."""
+    places = places[np.append(True, np.hypot(*np.diff(places[:, :2], axis=0).T) > 0.0)]
     way = way_along(places)
     ends = np.clip(way + np.array([[-_STANDS_M], [_STANDS_M]]), 0.0, way[-1])
     first, last = (np.column_stack([np.interp(at, way, places[:, k]) for k in range(2)]) for at in ends)
@@ -78,15 +80,15 @@ def _stations(parts: list[Float64], earlier: Float64, number: int, parted: Parte
     found = [stops(part, STATION_M, _LATTICE_M) for part in parts]
     headings = []
     for one in found:
-        smooth = scipy.ndimage.gaussian_filter1d(one, 4.0, axis=0, mode="nearest", truncate=2.0)
+        smooth = scipy.ndimage.gaussian_filter1d(one[:, :2], 4.0, axis=0, mode="nearest", truncate=2.0)
         heading = np.gradient(smooth, axis=0)
         headings.append(heading / np.maximum(np.hypot(*heading.T), 1e-9)[:, None])
-    places, heading = np.concatenate(found), np.concatenate(headings)
+    (places, level), heading = np.split(np.concatenate(found), [2], axis=1), np.concatenate(headings)
     part = np.repeat(np.arange(len(found)), [len(one) for one in found])
-    before = _came_from(places, heading, part)
+    before = _came_from(places, heading, part, level[:, 0])
     if len(earlier):
-        away, at = scipy.spatial.cKDTree(earlier).query(places)
-        before = np.where((away <= SAME_ROAD_M)[:, None], earlier[at], before)
+        near = _nearest(np.hstack([places, level]), earlier)
+        before = np.where(np.isfinite(near), near, before)
     free = np.isnan(before[:, 0])
     if parted is not None:
         apart = np.zeros(free.size, np.bool_)
@@ -98,7 +100,19 @@ def _stations(parts: list[Float64], earlier: Float64, number: int, parted: Parte
                 yield Track(places[rows], heading[rows], number)
 
 
-def _came_from(places: Float64, heading: Float64, part: Int64) -> Float64:
+def _nearest(places: Float64, earlier: Float64) -> Float64:
+    """Returns the nearest (n, 2) of earlier places (m, 3) on the road of places (n, 3); NaN where there is none."""
+    tree = scipy.spatial.cKDTree(earlier[:, :2])
+    away, at = tree.query(places[:, :2])
+    found = np.where((away <= SAME_ROAD_M)[:, None], earlier[at, :2], np.nan)
+    for k in np.flatnonzero((away <= SAME_ROAD_M) & (np.abs(earlier[at, 2] - places[:, 2]) > _SAME_LEVEL_M)).tolist():
+        about = earlier[tree.query_ball_point(places[k, :2], SAME_ROAD_M)]
+        same = about[np.abs(about[:, 2] - places[k, 2]) <= _SAME_LEVEL_M, :2]
+        found[k] = same[np.argmin(np.hypot(*(same - places[k, :2]).T))] if len(same) else np.nan
+    return found
+
+
+def _came_from(places: Float64, heading: Float64, part: Int64, level_m: Float64) -> Float64:
     """Returns the places (n, 2) beside stations that the same pass drove before, there or back; NaN where it did not.
 
     Before is what it drove until it last was out of reach of the station, or turned away from its heading. So neither
@@ -111,6 +125,7 @@ def _came_from(places: Float64, heading: Float64, part: Int64) -> Float64:
         onward = near[(cosine >= 0.0) & (part[near] == part[k])][::-1]
         begun = k - np.count_nonzero(onward == k - 1 - np.arange(len(onward)))
         beside = np.abs((places[near] - places[k]) @ heading[k]) <= _BESIDE_M
+        beside &= np.abs(level_m[near] - level_m[k]) <= _SAME_LEVEL_M
         same = near[(near < begun) & beside & (np.abs(cosine) >= _PARALLEL)]
         if same.size:
             found[k] = places[same[np.argmin(np.hypot(*(places[same] - places[k]).T))]]

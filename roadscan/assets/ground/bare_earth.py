@@ -139,7 +139,7 @@ def above_planes(place: Place, grid: Grid, on_ground: Bool) -> Found:
     return Found(base, above, on_ground)
 
 
-_REACH_M: Final = 8.0
+ROAD_REACH_M: Final = 8.0
 """Road reaches this far to both sides of the drive (m)."""
 _DRIVEN_M: Final = 1.25
 """Ground this near to the drive (m) was driven on."""
@@ -159,7 +159,7 @@ def road_cells(ground: GroundModel, drive_xyh_m: npt.NDArray[np.float64]) -> Boo
     if not driven.any():
         return driven
     away = distances(driven, ground.cell_m)
-    even = (steps(ground.height_m) <= _STEEPEST_ROAD * ground.cell_m) & (away < _REACH_M)
+    even = (steps(ground.height_m) <= _STEEPEST_ROAD * ground.cell_m) & (away < ROAD_REACH_M)
     inner = cv2.erode(even.view(np.uint8), _PLUS)
     count, label = cv2.connectedComponents(inner, connectivity=4)
     reached = np.zeros(count, np.bool_)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -15,7 +15,7 @@ from roadscan.assets import classes
 from roadscan.assets.kernels.columns import mark_corridor
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, KindOptions
 from roadscan.assets.probabilities import logistic
-from roadscan.assets.scene import Scene
+from roadscan.assets.scene import SAME_LEVEL_M, Scene
 from roadscan.assets.upright.pieces import passes_of
 from roadscan.assets.upright.slices import ground_light, usable
 from roadscan.compute.array_types import Float64, Int64
@@ -24,6 +24,8 @@ CELL_M: Final = 0.5  # Edge of a cell (m).
 _SUPPORT_M: Final = 0.25  # Returns within this height above the lowest one support it (m).
 _NOISE_M: Final = 0.1  # Returns within this height above the lowest one give its height (m).
 _NEAR_M: Final = 12.0  # Returns nearer than this (m) always count.
+_SAME_ROAD_M: Final = 0.5
+"""Ground beside a drive differs by no more from the road under it (m): a kerb, the crossfall."""
 PIECE_SCHEMA: Final = pa.schema(
     [
         ("pass_id", pa.int32()), ("easting_m", pa.float64()), ("northing_m", pa.float64()), ("height_m", pa.float64()),
@@ -53,9 +55,7 @@ class ClearanceOptions(KindOptions):
 def overhead_cells(scene: Scene, options: ClearanceOptions) -> pa.Table:
     """Returns the lowest supported return above each cell of the corridors of all drives, in the scene's tile."""
     returns, tile = scene.returns, scene.tile
-    above = scene.above_ground_m
-    hanging = usable(scene) & (above >= options.lowest_m) & (above <= options.highest_m)
-    hanging &= tile.holds(returns.x_m, returns.y_m)
+    hanging = usable(scene) & (scene.above_ground_m >= options.lowest_m) & tile.holds(returns.x_m, returns.y_m)
     rows = np.flatnonzero(hanging)
     ranges = np.hypot(returns.x_m[rows] - returns.sensor_x_m[rows], returns.y_m[rows] - returns.sensor_y_m[rows])
     column = np.floor((returns.x_m[rows] - tile.x_min_m) / CELL_M).astype(np.int64)
@@ -65,21 +65,47 @@ def overhead_cells(scene: Scene, options: ClearanceOptions) -> pa.Table:
     corner = np.array([tile.x_min_m, tile.y_min_m])
     bright = 2.0 * ground_light(scene)
     found: list[dict[str, Any]] = []
-    for pass_id in np.unique(scene.drive_xyh_m[:, 3]).tolist():
-        drive = scene.drive_xyh_m[scene.drive_xyh_m[:, 3] == pass_id]
+    for pass_id, drive in _drives_of(scene):
         inside = np.zeros(shape, np.bool_)
         x, y = np.ascontiguousarray(drive[:, 0]), np.ascontiguousarray(drive[:, 1])
         mark_corridor(x, y, options.corridor_m / 2, corner, CELL_M, inside)
-        own = np.flatnonzero(inside[row, column])
-        flat = row[own] * columns + column[own]
-        own, flat = _near_enough(own, flat, ranges)
-        order = np.lexsort((returns.height_m[rows[own]], flat))
-        kept, cells = rows[own][order], flat[order]
+        under = np.flatnonzero(inside[row, column])
+        road = np.full(rows.size, np.nan)
+        road[under] = _roads_below(scene, rows[under], drive)
+        above = returns.height_m[rows[under]] - road[under]
+        under = under[(above >= options.lowest_m) & (above <= options.highest_m)]
+        flat = row[under] * columns + column[under]
+        under, flat = _near_enough(under, flat, ranges)
+        order = np.lexsort((returns.height_m[rows[under]], flat))
+        kept, cells = under[order], flat[order]
         for part in np.split(kept, np.flatnonzero(np.diff(cells)) + 1):
-            one = _cell(scene, part, options, bright)
+            one = _cell(scene, rows[part], options, bright, road[part])
             if one is not None:
-                found.append({"pass_id": int(pass_id), **one})
+                found.append({"pass_id": pass_id, **one})
     return pa.Table.from_pylist(found, schema=PIECE_SCHEMA)
+
+
+def _drives_of(scene: Scene) -> Iterator[tuple[int, Float64]]:
+    """Yields each pass with the places (p, 3) of its drive on all levels: x, y and height of the road."""
+    on_ground = scene.drive_xyh_m.copy()
+    on_ground[:, 2] = scene.ground.height_at(on_ground[:, 0], on_ground[:, 1])
+    hidden = scene.hidden_xyh_m[np.isfinite(scene.hidden_xyh_m[:, 2])]
+    for drive in (on_ground, hidden):
+        for pass_id in np.unique(drive[:, 3]).tolist():
+            yield int(pass_id), drive[drive[:, 3] == pass_id, :3]
+
+
+def _roads_below(scene: Scene, rows: Int64, drive_xyh_m: Float64) -> Float64:
+    """Returns the height (k,) above which some returns hang over a drive (p, 3), NaN where they do not.
+
+    It is that of the ground under them, but where a drive has the ground of another level: there that of its road.
+    What hangs above ground that is higher than the road hangs above another level.
+    """
+    x, y = scene.returns.x_m[rows], scene.returns.y_m[rows]
+    _, at = cKDTree(drive_xyh_m[:, :2]).query(np.column_stack([x, y]))
+    ground, road = scene.ground.height_at(x, y), drive_xyh_m[at, 2]
+    below = np.where(np.abs(ground - road) > _SAME_ROAD_M, road, ground)
+    return np.where(ground > road + SAME_LEVEL_M, np.nan, below)
 
 
 def _near_enough(own: Int64, flat: Int64, ranges: Float64) -> tuple[Int64, Int64]:
@@ -95,8 +121,8 @@ def _near_enough(own: Int64, flat: Int64, ranges: Float64) -> tuple[Int64, Int64
     return own[near], flat[near]
 
 
-def _cell(scene: Scene, part: Int64, options: ClearanceOptions, bright: float) -> dict[str, Any] | None:
-    """Returns the lowest supported return of a cell, of rows sorted by height."""
+def _cell(scene: Scene, part: Int64, options: ClearanceOptions, bright: float, road: Float64) -> dict[str, Any] | None:
+    """Returns the lowest supported return of a cell, of rows sorted by height; road : height under each."""
     returns = scene.returns
     heights = returns.height_m[part]
     need = options.least_returns
@@ -109,13 +135,10 @@ def _cell(scene: Scene, part: Int64, options: ClearanceOptions, bright: float) -
     low = part[i]
     near = part[(heights >= heights[i]) & (heights <= heights[i] + 2 * _SUPPORT_M)]
     x, y, height = float(returns.x_m[low]), float(returns.y_m[low]), _lowest(heights[i:])
-    ground = float(scene.ground.height_at(x, y))
-    if not np.isfinite(ground):
-        return None
     epochs = returns.epoch_gps_ns[near]
     return {
         "easting_m": returns.corner_m[0] + x, "northing_m": returns.corner_m[1] + y, "height_m": height,
-        "clearance_m": height - ground, "returns": int(near.size),
+        "clearance_m": height - float(road[i]), "returns": int(near.size),
         "vegetation": float(np.isin(scene.classes[near], classes.VEGETATION).mean()),
         "bright": float((returns.intensity[near] >= bright).mean()),
         "thickness_m": float(np.quantile(returns.height_m[near], 0.9) - height),

@@ -185,7 +185,7 @@ def _road_roughness_m(scene: Scene, moments: PassMoments, grid: CellGrid) -> flo
     """Returns how the heights of the survey's road scatter within passes (m): by this scene where it is not known."""
 
     def of_scene() -> Float64:
-        road = _cells_with(scene, classes.ROAD, grid.corner, grid.shape)
+        road = _cells_with(scene, classes.ROAD, grid.corner, grid.shape, _LOW_M)
         return np.asarray(moments.scatter_m()[road & (moments.sums[:, 0].sum(axis=0) >= _LEAST_RETURNS)])
 
     return scene.statistics.of("road_roughness_m", 0.5, of_scene)

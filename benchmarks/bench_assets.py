@@ -97,5 +97,5 @@ def join(plan: AssetPlan, pieces: dict[str, list[pa.Table]]) -> float:
         others = {name: found.get(name, []) for name in one.kind.after}
         kind = asset_kinds()[one.name]
         rows = pa.concat_tables([kind.piece_schema.empty_table(), *pieces.get(one.name, ())]).combine_chunks()
-        found[one.name] = list(kind.objects(rows, one.options, others))  # type: ignore[arg-type]
+        found[one.name] = list(kind.objects(kind.joined(rows), one.options, others))  # type: ignore[arg-type]
     return time.process_time() - began

@@ -15,6 +15,7 @@ import os
 import resource
 import shutil
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.coloured_streets import colour_and_lidar, rig
 from benchmarks.labelled_street import RECORDING, laid_out, survey_text
+from benchmarks.timing import Figure
 from roadscan.run.session import Session
 from roadscan.run.stage import stage_named
 from roadscan.store.manifest import recorded_table
@@ -34,6 +36,7 @@ Float64 = npt.NDArray[np.float64]
 STAGES = ("ingest", "navigate", "footprints", "picture_ties", "adjust")
 AXES = ("roll", "pitch", "heading")
 FRAMES = tuple(range(0, 37, 3))
+TURN_DEG = (1.0, -1.0, 1.0)
 STREET_FROM_VELODYNE = (
     np.array(
         [
@@ -75,11 +78,41 @@ def turned(file: Path, off_deg: Float64) -> None:
     file.write_text(f"{text}\n[picture_ties]\n")
 
 
+def left_after(file: Path, off_deg: Float64) -> Iterator[tuple[str, Float64, Float64]]:
+    """Yields who says it, and what is left of the turn with its σ (3,) about the axes of the body (°), after a run.
+
+    file : of a survey whose camera is turned by `off_deg` first.
+    """
+    turned(file, off_deg)
+    session = Session.open(file)
+    run_stages(session, [stage_named(name) for name in STAGES])
+    for record in session.manifest.of("edge_boresights").values():
+        for row in recorded_table(session.store, record).to_pylist():
+            found, sigma = (np.array([row[f"{word}{a}_deg"] for a in AXES], np.float64) for word in ("", "sigma_"))
+            why = row["why_not"] or "used"
+            yield f"{row['edges']} edges in {row['pictures']} pictures, {why}", found + off_deg, sigma
+    table = read_small(session.store, "mounting_corrections")
+    for row in [] if table is None else table.to_pylist():
+        if row["sensor"] == "camera":
+            names = [f"{axis}_rad" for axis in AXES]
+            found, sigma = (np.degrees([row[f"{word}{name}"] for name in names]) for word in ("", "sigma_"))
+            yield "adjusted", found + off_deg, sigma
+
+
+def figures(folder: Path) -> Iterator[Figure]:
+    """Yields what the adjustment leaves of a turn by 1° about each axis."""
+    data = Path(os.environ.get("ROADSCAN_DATA", "../shared/data"))
+    file = colour_and_lidar(data / "pictures" / "colour_and_lidar", folder / "drive", "", FRAMES)
+    *_, (_, left, sigma) = left_after(file, np.array(TURN_DEG))
+    for axis, one, its_sigma in zip(AXES, left.tolist(), sigma.tolist(), strict=True):
+        yield Figure(f"boresight, colour_and_lidar, {axis}: left of 1°", abs(one), "°", None, f"1 σ {its_sigma:.2f}°")
+
+
 def main() -> None:
     """Print what is left."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("off", type=float, nargs="*", default=[1.0, -1.0, 1.0])
+    parser.add_argument("off", type=float, nargs="*", default=TURN_DEG)
     parser.add_argument("--half", type=int, choices=(0, 1))
     parser.add_argument("--street", action="store_true")
     asked = parser.parse_args()
@@ -89,22 +122,8 @@ def main() -> None:
     else:
         frames = FRAMES if asked.half is None else FRAMES[asked.half :: 2]
         file = colour_and_lidar(data / "pictures" / "colour_and_lidar", asked.folder, "", frames)
-    off = np.array(asked.off)
-    turned(file, off)
-    session = Session.open(file)
-    run_stages(session, [stage_named(name) for name in STAGES])
-    for record in session.manifest.of("edge_boresights").values():
-        for row in recorded_table(session.store, record).to_pylist():
-            left, sigma = (np.array([row[f"{word}{a}_deg"] for a in AXES], np.float64) for word in ("", "sigma_"))
-            why = row["why_not"] or "used"
-            print(f"{row['edges']} edges in {row['pictures']} pictures, {why}: left", (left + off).round(3), "1 σ",
-                  sigma.round(3))  # fmt: skip
-    table = read_small(session.store, "mounting_corrections")
-    for row in [] if table is None else table.to_pylist():
-        if row["sensor"] == "camera":
-            names = [f"{axis}_rad" for axis in AXES]
-            left, sigma = (np.degrees([row[f"{word}{name}"] for name in names]) for word in ("", "sigma_"))
-            print("adjusted: left", (left + off).round(3), "1 σ", sigma.round(3))
+    for what, left, sigma in left_after(file, np.array(asked.off)):
+        print(f"{what}: left", left.round(3), "1 σ", sigma.round(3))
     used = resource.getrusage(resource.RUSAGE_SELF)
     print(f"processor time {used.ru_utime + used.ru_stime:.1f} s, {used.ru_maxrss / 1e6:.2f} GB")
 

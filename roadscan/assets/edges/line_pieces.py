@@ -357,6 +357,10 @@ HOLE_NODES: Final = 14
 """Longest run of nodes without a width that is bridged within a strip: a car may stand there."""
 
 
+_ROUND_M: Final = 1.0
+"""A line whose ends are so near (m) goes round: a sharp corner may be left out."""
+
+
 class Strip(NamedTuple):
     """A run of nodes of a line, and the width behind each."""
 
@@ -380,21 +384,30 @@ class Strip(NamedTuple):
         return float(np.median(values[good])) if good.any() else None
 
 
-def strips_of(line: Line, usable: Bool, least_m: float, shortest_m: float) -> Iterator[Strip]:
+def strips_of(
+    line: Line, usable: Bool, least_m: float, shortest_m: float, other: Bool | None = None
+) -> Iterator[Strip]:
     """Yields runs of the usable nodes (n,) of a line with columns of `BESIDE_PIECES`, at least `shortest_m` long.
 
-    least_m : least width of the surface behind the line (m).
+    least_m : least width of the surface behind the line (m). other : (n,) nodes behind which something else was seen,
+    over which no hole is bridged; None: there are none.
     """
-    width = line.column("width_m")
-    at = np.flatnonzero(usable & np.isfinite(width))
+    other = np.zeros(len(usable), np.bool_) if other is None else other
+    usable = usable & np.isfinite(line.column("width_m"))
+    at = np.flatnonzero(usable)
     if at.size < 2:
         return
+    if at[0] > 0 and _is_closed(line):
+        # A closed line begins where it is usable, so that no strip ends where it began.
+        rows = np.append(np.arange(at[0], len(usable)), np.arange(1, at[0] + 1))
+        line, usable, other = Line(line.nodes[rows], line.seen_by, line.names), usable[rows], other[rows]
+        at = np.flatnonzero(usable)
+    width = line.column("width_m")
     level = scipy.ndimage.median_filter(width[at], MEDIAN_NODES, mode="nearest")
     smooth = np.interp(np.arange(len(width)), at, level)
     known = np.zeros(len(width), np.bool_)
     known[at[level >= least_m]] = True
-    whole = scipy.ndimage.binary_closing(np.pad(known, HOLE_NODES), np.ones(HOLE_NODES + 1))[HOLE_NODES:-HOLE_NODES]
-    number, count = scipy.ndimage.label(whole)
+    number, count = scipy.ndimage.label(bridged(line, known) & ~other)
     for k in range(1, count + 1):
         rows = np.flatnonzero(number == k)
         if len(rows) < 2:
@@ -402,6 +415,16 @@ def strips_of(line: Line, usable: Bool, least_m: float, shortest_m: float) -> It
         part = Line(line.nodes[rows], line.seen_by, line.names)
         if part.length_m >= shortest_m:
             yield Strip(part, smooth[rows], known[rows])
+
+
+def bridged(line: Line, flags: Bool) -> Bool:
+    """Returns flags (n,) of a line's nodes that are true also in holes of 7 m between true ones."""
+    wide = np.pad(flags, HOLE_NODES, mode="wrap" if _is_closed(line) else "constant")
+    return np.asarray(scipy.ndimage.binary_closing(wide, np.ones(HOLE_NODES + 1))[HOLE_NODES:-HOLE_NODES])
+
+
+def _is_closed(line: Line) -> bool:
+    return float(np.hypot(*(line.nodes[-1, :2] - line.nodes[0, :2]))) <= _ROUND_M
 
 
 def polygon_of(strip: Strip) -> shapely.Polygon | None:

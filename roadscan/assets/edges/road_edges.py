@@ -26,15 +26,18 @@ from roadscan.assets.edges.line_pieces import (
     closed_nodes,
     columns_of,
     cut_at,
+    dense,
     gathered,
     line_schema,
     lines_table,
 )
+from roadscan.assets.edges.once import FEWEST, FoundEdge, each_once
 from roadscan.assets.edges.profiles import smooth_line
 from roadscan.assets.edges.steps import CELL_M, raster_of
-from roadscan.assets.edges.tracks import STATION_M, Parted, Track, tracks_of
+from roadscan.assets.edges.tracks import STATION_M, Parted, Track, bridged, tracks_of, unbroken
 from roadscan.assets.scene import Scene, once_a_scene
 from roadscan.compute.array_types import Bool, Float64, Int64
+from roadscan.compute.arrays import way_along
 from roadscan.compute.edges import EdgePath, counted, evidence_across, moved_cells, path_along
 
 NEAREST_M: Final = 0.8  # Edges are sought from this distance to the drive (m) …
@@ -47,7 +50,7 @@ _ROUND_M: Final = 3.0
 _KERB: Final = 6.0  # Evidence of a cell at a kerb.
 _BARRIER: Final = 3.0  # Evidence of a cell where something stands.
 _LEAST: Final = 0.6  # Least evidence of an edge at a station.
-_FEWEST: Final = 5  # Stations of an edge.
+_HOLE_M: Final = 10.0  # A longer hole of an edge (m) is none of it: evidence of a station is its mean over that.
 _AT_KERB_M: Final = 0.4  # An edge so near to its kerb (m) lies on it.
 _INSIDE_M: Final = (0.45, 0.95)
 """The height of an edge follows from the road this far inside it (m, from and to)."""
@@ -70,6 +73,7 @@ _LISTS: Final = {
     "place": (pa.float64(), (6,)), "level_m": (pa.float64(), ()), "pass_id": (pa.int32(), ()),
     "evidence": (pa.uint8(), (2, _OFFSETS.size)), "stands": (pa.uint8(), (2, _OFFSETS.size)),
     "level_mm": (pa.int16(), (2, _OFFSETS.size)), "returns": (pa.uint8(), (2, _OFFSETS.size)),
+    "driven": (pa.uint8(), (2,)),
     "passes": (pa.list_(pa.int32()), ()), "first_epoch_gps_ns": (pa.int64(), ()), "last_epoch_gps_ns": (pa.int64(), ()),
     "kerbs": (pa.float64(), (4,)),
 }  # fmt: skip
@@ -79,7 +83,8 @@ STATION_PIECES: Final = pa.schema(
 """Columns of what a square tells, one row. Of each of its stations: easting and northing, unit vector of the heading,
 and easting and northing of the next one; the height of the road and the pass; across the drive to its left and to its
 right the evidence of an edge without that of kerbs, whether something stands there, the height that an edge has there
-above that of the road (mm), and returns of the ground; passes and epochs of those. Kerbs: segments, the higher side to
+above that of the road (mm), and returns of the ground; how many cells it is to the farthest other drive there, 0 where
+there is none; passes and epochs of those returns. Kerbs: segments, the higher side to
 their right, from easting and northing to easting and northing."""
 
 
@@ -93,6 +98,7 @@ class _Stations(NamedTuple):
     stands: npt.NDArray[np.uint8]
     level_mm: npt.NDArray[np.int16]
     returns: npt.NDArray[np.uint8]
+    driven: npt.NDArray[np.uint8]
     passes: list[list[int]]
     first_epoch_gps_ns: Int64
     last_epoch_gps_ns: Int64
@@ -129,7 +135,7 @@ def _stations_of(scene: Scene) -> _Stations | None:
         [np.hstack([t.places, t.heading, np.vstack([t.places[1:], [[np.nan] * 2]])]) for t in tracks]
     )
     sides = [np.concatenate(one) for one in zip(*(_across(track, scene) for track in tracks), strict=True)]
-    evidence, stands, level, returns = sides
+    evidence, stands, level, returns, driven = sides
     level[~np.isfinite(level).any(axis=(1, 2))] = 0.0  # such a station has no returns
     road = np.nanmedian(level, axis=(1, 2))
     seen = _seen_across(place, scene)
@@ -137,7 +143,7 @@ def _stations_of(scene: Scene) -> _Stations | None:
     return _Stations(
         place, road, np.repeat([t.pass_id for t in tracks], [len(t.places) for t in tracks]).astype(np.int32),
         np.rint(_STEPS * evidence).astype(np.uint8), stands.astype(np.uint8), np.rint(above).astype(np.int16),
-        np.minimum(returns, 255).astype(np.uint8), [list(one.passes) for one in seen],
+        np.minimum(returns, 255).astype(np.uint8), driven.astype(np.uint8), [list(one.passes) for one in seen],
         np.array([one.first_epoch_gps_ns for one in seen]), np.array([one.last_epoch_gps_ns for one in seen]),
     )  # fmt: skip
 
@@ -164,8 +170,24 @@ def _parted_in(scene: Scene) -> Parted:
     return parted
 
 
-def _across(track: Track, scene: Scene) -> tuple[Float64, Bool, Float64, Int64]:
-    """Returns evidence without kerbs, whether something stands, the height of an edge, and returns (n, 2, offsets)."""
+@once_a_scene
+def _driven_in(scene: Scene) -> Bool:
+    """Returns a mask of the cells of a scene's raster that a drive led through, and of those around them."""
+    raster, drive = raster_of(scene), scene.drive_xyh_m
+    driven = np.zeros(raster.count.shape, np.bool_)
+    for number in np.unique(drive[:, 3]):
+        for part in unbroken(drive[drive[:, 3] == number, :2]):
+            x, y = dense(part, raster.cell_m)
+            inside = scene.extent.holds(x, y)
+            driven[raster.cells_of(x[inside], y[inside])] = True
+    return np.asarray(scipy.ndimage.binary_dilation(driven, np.ones((3, 3))))
+
+
+def _across(track: Track, scene: Scene) -> tuple[Float64, Bool, Float64, Int64, Int64]:
+    """Returns evidence without kerbs, whether something stands, the height of an edge, and returns (n, 2, offsets).
+
+    The last is how many cells it is to the farthest other drive (n, 2).
+    """
     raster, beside = raster_of(scene), beside_of(scene)
     sides = []
     for sign in (-1.0, 1.0):
@@ -198,7 +220,8 @@ def _across(track: Track, scene: Scene) -> tuple[Float64, Bool, Float64, Int64]:
         for other in (near, here, ground):
             level = np.where(np.isfinite(level), level, other)
         counts = [np.where(i, raster.count[r, c], 0) for r, c, i in (at(_OFFSETS, raster.cell_m * k) for k in _NEAR)]
-        sides.append((evidence, stands, level, np.sum(counts, axis=0)))
+        driven = (np.arange(1, _OFFSETS.size + 1) * (_driven_in(scene)[row, column] & inside)).max(axis=1)
+        sides.append((evidence, stands, level, np.sum(counts, axis=0), driven))
     return tuple(np.stack(both, axis=1) for both in zip(*sides, strict=True))  # type: ignore[return-value]
 
 
@@ -238,14 +261,27 @@ def edge_lines(pieces: pa.Table) -> pa.Table:
         kerbs = columns.pop("kerbs")
         stations = _Stations(**columns)
         segments = shapely.STRtree(shapely.linestrings(kerbs.reshape(-1, 2, 2)))
+        found = []
         for chain in _chains(stations):
             some = _Stations._make(
                 [column[k] for k in chain.tolist()] if isinstance(column, list) else column[chain]
                 for column in stations
             )
             for right in (False, True):
-                rows += _one_side(some, right, kerbs, segments)
+                found += [e._replace(rows=chain[e.rows]) for e in _one_side(some, right, kerbs, segments)]
+        rows = [_with_seen(edge, stations) for edge in each_once(found)]
     return lines_table([CutEdge(nodes, False, False) for nodes, _ in rows], [seen for _, seen in rows], EDGE_LINES)
+
+
+def _with_seen(edge: FoundEdge, stations: _Stations) -> tuple[Float64, Seen]:
+    """Returns the nodes of an edge, closed where it leads round, and what saw it."""
+    lap = _lap(edge.nodes[:, :2])
+    nodes = closed_nodes(edge.nodes[:lap]) if lap else edge.nodes
+    passes = sorted({one for k in edge.rows.tolist() for one in stations.passes[k]})
+    return nodes, Seen(
+        int(edge.returns.sum()), tuple(passes), int(stations.first_epoch_gps_ns[edge.rows].min()),
+        int(stations.last_epoch_gps_ns[edge.rows].max()),
+    )  # fmt: skip
 
 
 def _stacked(pieces: pa.Table, name: str) -> Any:
@@ -276,14 +312,15 @@ def _chains(stations: _Stations) -> Iterator[Int64]:
         yield np.array(chain, np.int64)
 
 
-def _one_side(
-    some: _Stations, right: bool, kerbs: Float64, segments: shapely.STRtree
-) -> Iterator[tuple[Float64, Seen]]:
-    """Yields the nodes (n, `EDGE_COLUMNS`) of one side's edges along a chain of stations, and what saw them."""
+def _one_side(some: _Stations, right: bool, kerbs: Float64, segments: shapely.STRtree) -> Iterator[FoundEdge]:
+    """Yields one side's edges along a chain of stations, with the columns `EDGE_COLUMNS`."""
     out = _right_of(some.place[:, 2:4]) * (1.0 if right else -1.0)
     side = int(right)
     up = _kerbs_across(some.place[:, :2], out, kerbs, segments)
-    found = _path(up, some.evidence[:, side])
+    hidden = _behind_parting((up | (some.stands[:, side] > 0)), some.driven[:, side])
+    evidence = np.where(hidden, 0, some.evidence[:, side]).astype(np.uint8)
+    up &= ~hidden
+    found = _path(up, evidence)
     near = np.clip(found.cell[:, None] + _NEAR, 0, _OFFSETS.size - 1)
     by_kerb, by_barrier = (
         scipy.ndimage.median_filter(np.take_along_axis(shown, near, axis=1).any(axis=1).astype(np.float64), 5)
@@ -291,7 +328,9 @@ def _one_side(
     )
     lines = some.place[:, :2] + _OFFSETS[found.cell, None] * out
     returns = np.take_along_axis(some.returns[:, side], near, axis=1).sum(axis=1)
-    for rows in _runs(found.evidence.round(6) >= _LEAST, found.cell, moved_cells(CELL_M)):
+    shown = np.where(up, _KERB, evidence)[np.arange(len(up)), found.cell] > 0.0
+    good = (found.evidence.round(6) >= _LEAST) & _with_holes(shown, lines)
+    for rows in _runs(good, found.cell, moved_cells(CELL_M)):
         line = _snapped(smooth_line(lines[rows], np.ones(len(rows))), by_kerb[rows] > 0.5, segments)
         offset = ((line - some.place[rows, :2]) * out[rows]).sum(axis=1)
         cell = np.clip(np.rint((offset - NEAREST_M) / CELL_M).astype(np.int64), 0, _OFFSETS.size - 1)
@@ -304,13 +343,22 @@ def _one_side(
         nodes[:, -4:] = np.column_stack(
             [by_kerb[rows], by_barrier[rows], np.full(len(rows), float(right)), found.evidence[rows]]
         )
-        lap = _lap(line)
-        nodes = closed_nodes(nodes[:lap]) if lap else nodes
-        passes = sorted({one for k in rows.tolist() for one in some.passes[k]})
-        yield nodes, Seen(
-            int(returns[rows].sum()), tuple(passes), int(some.first_epoch_gps_ns[rows].min()),
-            int(some.last_epoch_gps_ns[rows].max()),
-        )  # fmt: skip
+        yield FoundEdge(nodes, rows, returns[rows], out[rows], offset)
+
+
+def _behind_parting(shows: Bool, driven: npt.NDArray[np.uint8]) -> Bool:
+    """Returns a mask (n, offsets) of what lies behind a kerb, or something that stands, that parts two drives.
+
+    shows : (n, offsets) where such a thing is; driven : (n,) cells to another drive. Nothing behind is an edge of a
+    station's road. It parts them over five stations or more; between its posts as well.
+    """
+    parts = shows & (np.arange(shows.shape[1]) < driven[:, None])
+    seen = np.flatnonzero(parts.any(axis=1))
+    if not seen.size:
+        return parts
+    cell = np.interp(np.arange(len(parts)), seen, parts[seen].argmax(axis=1))
+    whole = scipy.ndimage.binary_opening(bridged(np.isin(np.arange(len(parts)), seen)), np.ones(FEWEST))
+    return np.asarray(whole[:, None] & (np.arange(parts.shape[1]) > cell[:, None] + _BEHIND))
 
 
 def _path(up: Bool, evidence: npt.NDArray[np.uint8]) -> EdgePath:
@@ -330,7 +378,7 @@ def _path(up: Bool, evidence: npt.NDArray[np.uint8]) -> EdgePath:
 
 def _lap(line: Float64) -> int:
     """Returns how many nodes of a line (n, 2) lead round to its beginning; 0 where it does not lead there."""
-    from_first, first, last = line - line[0], line[_FEWEST - 1] - line[0], line[-1] - line[-_FEWEST]
+    from_first, first, last = line - line[0], line[FEWEST - 1] - line[0], line[-1] - line[-FEWEST]
     near = np.hypot(*from_first.T) <= _ROUND_M
     if not near[-1] or first @ last <= 0.0:
         return 0
@@ -355,12 +403,25 @@ def _kerbs_across(places: Float64, out: Float64, kerbs: Float64, segments: shape
     return up[:, :-1]
 
 
+def _with_holes(shown: Bool, lines: Float64) -> Bool:
+    """Returns a mask (n,) of the stations that show an edge, and of holes between them: an edge does not end in one.
+
+    lines : (n, 2) its places. So an edge does not go on over bare asphalt where a drive turns, however short its way.
+    """
+    beside = scipy.ndimage.convolve1d(shown.astype(np.float64), np.ones(FEWEST), mode="constant")
+    at = np.flatnonzero(shown & (beside > 1.5))  # a lone one is chance
+    after = np.searchsorted(at, np.arange(len(shown)))
+    ends = way_along(lines)[at]
+    narrow = np.concatenate([[False], np.diff(ends) <= _HOLE_M, [False]])
+    return np.asarray(np.isin(np.arange(len(shown)), at) | narrow[after])
+
+
 def _runs(good: Bool, cell: Int64, moved: int) -> Iterator[Int64]:
     """Yields the rows of five stations or more in a run; where another edge is nearer to the best, a run ends."""
     begins = np.append(True, np.abs(np.diff(cell)) > moved) | ~good
     for rows in np.split(np.arange(good.size), np.flatnonzero(begins)[1:]):
         kept = rows[good[rows]]
-        if len(kept) >= _FEWEST:
+        if len(kept) >= FEWEST:
             yield kept
 
 

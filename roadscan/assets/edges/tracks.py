@@ -24,6 +24,8 @@ _PARALLEL: Final = 0.7
 """… and runs within 45° of its heading, or against it (cosine)."""
 _STANDS_M, _STRAIGHT = 0.5, 0.5
 """A drive moves where this way (m) before and behind a place leads away by this share of it: jitter does not."""
+_POSTS_M: Final = 5.0
+"""What parts two drives may have gaps of this length (m): posts of a wire rope are 2 to 4 m apart."""
 _FEWEST_STATIONS: Final = 4  # Stations of a track.
 
 
@@ -46,12 +48,21 @@ def tracks_of(drive_xyh_m: Float64, parted: Parted | None = None) -> Iterator[Tr
     earlier = np.zeros((0, 2))
     for number in np.unique(drive_xyh_m[:, 3]):
         driven = drive_xyh_m[drive_xyh_m[:, 3] == number, :2]
-        # A jump means that the vehicle left the window between.
-        jumps = np.flatnonzero(np.hypot(*np.diff(driven, axis=0).T) > 5.0) + 1
-        parts = [part for one in np.split(driven, jumps) if way_along(part := _moving(one))[-1] >= 2.0 * STATION_M]
+        parts = [part for one in unbroken(driven) if way_along(part := _moving(one))[-1] >= 2.0 * STATION_M]
         if parts:
             yield from _stations(parts, earlier, int(number), parted)
             earlier = np.concatenate([earlier, *parts])
+
+
+def unbroken(driven: Float64) -> list[Float64]:
+    """Returns the parts of a drive (k, 2) between jumps: there it left the window, or nobody knows where it was."""
+    return np.split(driven, np.flatnonzero(np.hypot(*np.diff(driven, axis=0).T) > 5.0) + 1)
+
+
+def bridged(parts: Bool) -> Bool:
+    """Returns a mask (n,) of stations where something parts drives, with the gaps between its posts."""
+    width = round(_POSTS_M / STATION_M)
+    return np.asarray(scipy.ndimage.binary_closing(np.pad(parts, width), np.ones(width + 1))[width:-width])
 
 
 def _moving(places: Float64) -> Float64:
@@ -78,7 +89,9 @@ def _stations(parts: list[Float64], earlier: Float64, number: int, parted: Parte
         before = np.where((away <= SAME_ROAD_M)[:, None], earlier[at], before)
     free = np.isnan(before[:, 0])
     if parted is not None:
-        free[~free] = parted(places[~free], before[~free])
+        apart = np.zeros(free.size, np.bool_)
+        apart[~free] = parted(places[~free], before[~free])
+        free |= bridged(apart)
     for first, end in runs_of(free):
         for rows in np.split(np.arange(first, end), np.flatnonzero(np.diff(part[first:end])) + 1):
             if len(rows) >= _FEWEST_STATIONS:

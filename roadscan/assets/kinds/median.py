@@ -72,12 +72,21 @@ def _same(a: shapely.Polygon, b: shapely.Polygon) -> bool:
     return float(a.intersection(b).area) > SAME_SHARE * min(float(a.area), float(b.area))
 
 
+def _length_m(polygon: shapely.Polygon, width_m: float) -> float:
+    """Returns the length of a polygon of this width, also of a bent one and of one whose kerb goes round it.
+
+    Rounded ends take area off: so it is as long as its outline at least.
+    """
+    corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(polygon))
+    return max(float(polygon.area) / width_m, float(np.hypot(*np.diff(corners, axis=0).T).max()))
+
+
 def _median(strip: Strip, polygon: shapely.Polygon, probability: float) -> AssetObject:
     seen_by = strip.line.seen_by
     attributes = {
         "width_m": float(np.mean(strip.width_m)),
         "asset_height_m": strip.mean(strip.column("step_m")),
-        "length_m": strip.length_m,
+        "length_m": _length_m(polygon, float(np.mean(strip.width_m))),
     }
     return AssetObject(
         geometry=polygon,

@@ -7,10 +7,20 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pyarrow as pa
+import scipy.ndimage
 from pydantic import Field
 
 from roadscan.assets.edges.beside import BESIDE_PIECES, pieces_beside
-from roadscan.assets.edges.line_pieces import Strip, joined_lines, polygon_of, running_slope, sigma_width_m, strips_of
+from roadscan.assets.edges.line_pieces import (
+    MEDIAN_NODES,
+    Strip,
+    bridged,
+    joined_lines,
+    polygon_of,
+    running_slope,
+    sigma_width_m,
+    strips_of,
+)
 from roadscan.assets.edges.profiles import REACH_M
 from roadscan.assets.green.edges import ended_at_green
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence
@@ -61,8 +71,10 @@ class Sidewalk(AssetKind):
             probability = line.probability
             if probability < settings.least_probability:
                 continue
-            usable = line.column("ends_down") < 0.5
-            for strip in strips_of(line, usable, settings.least_width_m, settings.least_length_m):
+            ends_down = line.column("ends_down") >= 0.5
+            # The ends of an island are longer than a surface is followed; both sides tell that it is a median.
+            median = bridged(line, scipy.ndimage.median_filter(ends_down, MEDIAN_NODES, mode="nearest"))
+            for strip in strips_of(line, ~ends_down, settings.least_width_m, settings.least_length_m, median):
                 found = _sidewalk(strip, probability, settings)
                 if found is not None:
                     yield found

@@ -46,6 +46,9 @@ class ReturnsTask:
     """Full angle of the beam of each, NaN where it is not known (degrees)."""
     ways: tuple[tuple[str, TrajectorySource], ...]
     """Trajectories of runs whose clouds are used, by run."""
+    leading: tuple[ReadingSource, ...]
+    """Of each run the sensor whose places are its drive, also while others alone record: so the drive is that of one
+    place on the vehicle, and no sensor's gap interrupts or moves it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,33 +219,33 @@ class _Block:
         return parts[0] if len(parts) == 1 else np.concatenate([np.zeros((0, 3)), *parts])
 
     def _places(self, number: int, epochs_gps_ns: Int64) -> Float64:
-        trajectory, source = self._trajectories[number], self._sources[number]
+        return self._places_of(self._sources[number], self._trajectories[number], epochs_gps_ns)
+
+    def _places_of(self, source: ReadingSource, trajectory: Trajectory | None, epochs_gps_ns: Int64) -> Float64:
+        """Returns easting, northing, height (n, 3) of a source's sensor on a trajectory of its run."""
         if trajectory is None or trajectory.epochs_gps_ns.size < 2:
             return np.full((epochs_gps_ns.size, 3), np.nan)
         mountings = Mountings.one(UNMOUNTED) if source.table == "cloud" else source.adjusted_mountings
         return sensor_places(trajectory, self._ground.map, mountings, epochs_gps_ns)
 
     def _drives(self, own: _Columns, squares: tuple[TileId, ...]) -> Float64:
-        """Places (p, 4) of the first sensor of each pass within the window while it looked there, and the pass."""
-        grid = self._task.grid
-        found = [np.zeros((0, 4))]
-        seen: set[int] = set()
+        """Places (p, 4) of each run's leading sensor within the window while any looked there, and the pass."""
+        grid, leading = self._task.grid, {one.run: one for one in self._task.leading}
+        found = [np.zeros((0, 5))]
         for number, rows in _by_source(own.source, len(self._sources)):
-            ids = own.pass_id[rows]
+            ids, epochs = own.pass_id[rows], own.epoch_gps_ns[rows]
             held = [int(ids[0])] if ids.min() == ids.max() else np.flatnonzero(np.bincount(ids)).tolist()
             for one in held:
-                if one in seen:
-                    continue
-                epochs = own.epoch_gps_ns[rows]
                 tick = distinct_steps(epochs if len(held) == 1 else epochs[ids == one], _DRIVE_TICK_NS)
-                places = self._places(number, tick * _DRIVE_TICK_NS + _DRIVE_TICK_NS // 2)
+                middle, source = tick * _DRIVE_TICK_NS + _DRIVE_TICK_NS // 2, leading[self._sources[number].run]
+                places = self._places_of(source, self._trajectories[number], middle)
                 places[:, :2] -= grid.origin_m(squares[0])
-                places = places[grid.classes_box(*squares).holds(places[:, 0], places[:, 1])]
-                if len(places):
-                    seen.add(one)
-                    found.append(np.column_stack([thinned(places), np.full(len(thinned(places)), float(one))]))
+                inside = grid.classes_box(*squares).holds(places[:, 0], places[:, 1])
+                found.append(np.column_stack([places, np.full(tick.size, float(one)), tick])[inside])
         drives = np.concatenate(found)
-        return drives[np.argsort(drives[:, 3], kind="stable")]
+        drives = drives[np.unique(drives[:, 3:], axis=0, return_index=True)[1], :4]  # sensors share ticks
+        ends = np.flatnonzero(np.diff(drives[:, 3])) + 1
+        return np.concatenate([thinned(part) for part in np.split(drives, ends)])
 
 
 def _metres(quanta: npt.NDArray[np.integer[Any]]) -> Float64:
@@ -355,7 +358,7 @@ def _by_source(source: npt.NDArray[np.uint16], count: int) -> Iterator[tuple[int
 
 
 def thinned(places_m: Float64) -> Float64:
-    """Returns places (k, 3) of a drive without those where it has hardly moved."""
+    """Returns places (k, …) of a drive, x and y first, without those where it has hardly moved."""
     cell = np.floor(places_m[:, :2] / _DRIVE_STEP_M)
     moved = np.ones(len(places_m), bool)
     moved[1:] = (np.diff(cell, axis=0) != 0).any(axis=1)

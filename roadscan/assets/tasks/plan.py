@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -167,7 +167,8 @@ class AssetPlan:
         under = dict.fromkeys(t for square in squares for t in grid.tiles_under(square) if t in known)
         own = tuple(sorted(under, key=lambda t: (t.row, t.column)))
         widths = _divergences(self.survey.survey, self.sensors)
-        return ReturnsTask(grid, squares, self.tiles.task(Block(own)), self.sensors, widths, self.ways)
+        leading = tuple(_leading(self.survey, self.config).values())
+        return ReturnsTask(grid, squares, self.tiles.task(Block(own)), self.sensors, widths, self.ways, leading)
 
     def near(self, chosen: Sequence[TileId]) -> set[TileId]:
         """Returns squares that see one of some of the survey's tiles, in themselves or in their halo."""
@@ -208,7 +209,7 @@ def plan_assets(plan: SurveyPlan, footprints: FootprintRanges) -> AssetPlan:
         [[w.world, [f.digest for f in w.files], _corrections(plan, run)] for run, w in ways],
         [str(width) for width in _divergences(plan.survey, chosen)],
     )  # fmt: skip
-    own = _looked_at(footprints, config)
+    own = _looked_at(footprints, config, _leading(plan, config))
     tiles = plan_tiles(own, replace(plan, tile_key=common))
     held = TilePlan(plan, own, tiles, (), product_context(plan))
     readings = readings_of(grid, tiles)
@@ -285,11 +286,26 @@ def check_assets(survey: Survey) -> None:
             )
 
 
-def _looked_at(footprints: FootprintRanges, config: AssetsConfig) -> FootprintRanges:
-    """Returns footprints of the used sources; of their profiles also those that are not road."""
+def _leading(plan: SurveyPlan, config: AssetsConfig) -> dict[str, ReadingSource]:
+    """Returns by run the first of its used sources, by the sensor's name."""
+    used = [source for source, _ in plan.sources if is_looked_at(source, config)]
+    return {one.run: one for one in sorted(used, key=lambda s: (s.run, s.sensor, s.table, s.key), reverse=True)}
+
+
+def _looked_at(
+    footprints: FootprintRanges, config: AssetsConfig, leading: Mapping[str, ReadingSource]
+) -> FootprintRanges:
+    """Returns footprints of the used sources; of their profiles also those that are not road.
+
+    Their keys tell the mounting of their run's leading sensor too, which may have no readings there.
+    """
     held = np.array([is_looked_at(one.source, config) for one in footprints.slices], bool)
     rows = held[footprints.slice_index] if held.size else np.zeros(0, bool)
-    slices = tuple(replace(one, source=replace(one.source, road=None)) for one in footprints.slices)
+    mounted = {run: asdict(one.adjusted_mountings) for run, one in leading.items()}
+    slices = tuple(
+        replace(one, source=replace(one.source, road=None, key=key_of(one.source.key, mounted.get(one.source.run))))
+        for one in footprints.slices
+    )
     return FootprintRanges(
         footprints.tile_column[rows], footprints.tile_row[rows], footprints.slice_index[rows],
         footprints.first_group[rows], footprints.last_group[rows], footprints.readings[rows],

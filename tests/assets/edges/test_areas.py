@@ -117,6 +117,32 @@ def test_a_median_has_width_and_height() -> None:
     assert not list(walks.objects(walks.evidence(scene, SidewalkOptions()).pieces, SidewalkOptions(), {}))
 
 
+@pytest.mark.slow
+def test_the_length_of_an_island_is_not_that_of_its_kerb() -> None:
+    """A refuge of 8 m by 2 m with round ends, whose kerb of 18 m is one closed line."""
+    scene = seen_surface(
+        (30.0, 8.0, -4.0),
+        lambda x, y: (
+            100.0 - 0.02 * np.abs(y) + np.where(np.hypot(np.maximum(np.abs(x - 15.0) - 3.0, 0.0), y) < 1.0, 0.12, 0.0)
+        ),
+    )
+    kind = Median()
+    (found,) = kind.objects(kind.evidence(scene, MedianOptions()).pieces, MedianOptions(), {})
+    assert found.attributes["length_m"] == pytest.approx(8.0, abs=0.3)
+    assert found.attributes["width_m"] == pytest.approx(2.0, abs=0.15)
+
+
+@pytest.mark.slow
+def test_the_ends_of_an_island_are_no_sidewalk() -> None:
+    """An island of 20 m by 4 m: from its ends no surface is followed to the other."""
+    scene = seen_surface(
+        (30.0, 8.0, -4.0),
+        lambda x, y: 100.0 - 0.02 * np.abs(y) + np.where((np.abs(x - 15.0) < 10.0) & (np.abs(y) < 2.0), 0.12, 0.0),
+    )
+    kind = Sidewalk()
+    assert not list(kind.objects(kind.evidence(scene, SidewalkOptions()).pieces, SidewalkOptions(), {}))
+
+
 def walkway(ramp: bool) -> Scene:
     """A road that rises by 3 % with a kerb of 12 cm to its left, 2.5 m of a walkway that rises by 2 % away from the
     road, and a wall behind it; with a ramp, the kerb is 2 cm high for 4 m.

@@ -103,3 +103,13 @@ def test_an_edge_is_the_same_in_blocks_of_any_length(monkeypatch: pytest.MonkeyP
         cell, mean = road_edges._path(up, evidence)
         assert (cell == whole.cell).all()
         assert np.allclose(mean, whole.evidence, rtol=0.0, atol=1e-9)
+
+
+def test_an_edge_bridges_holes_between_stations_that_show_it() -> None:
+    """Holes of 9 m and of 11 m, a lone station, and ends; a chain of two stations that show it, and of one."""
+    shown = np.repeat([0, 1, 0, 1, 0, 1, 0, 1, 0], [4, 6, 17, 6, 21, 6, 8, 1, 3]) > 0
+    wanted = np.repeat([0, 1, 0, 1, 0], [4, 29, 21, 6, 12]) > 0
+    lines = 0.5 * np.arange(shown.size)[:, None] * [0.6, 0.8]
+    assert (road_edges._with_holes(shown, lines) == wanted).all()
+    assert (road_edges._with_holes(shown[4:6], lines[:2]) == [True, True]).all()
+    assert (road_edges._with_holes(shown[4:5], lines[:1]) == [False]).all()

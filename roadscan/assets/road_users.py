@@ -23,7 +23,7 @@ from roadscan.assets.moving import (
     sides_m,
     tracks,
 )
-from roadscan.assets.quantiles import quantiles
+from roadscan.assets.quantiles import median, quantiles
 from roadscan.assets.scene import Box, Returns
 from roadscan.assets.surroundings import Cubes
 from roadscan.compute.array_types import Bool, Float64, Int32
@@ -53,6 +53,9 @@ _LINE_CELLS: Final = 35
 row the side that is seen has a gap."""
 _LINE_GAP: Final = 1
 """Empty cells that do not end a line: rows of cars have wider gaps."""
+_UPPER, _EVEN = 0.75, 0.6
+"""So large a share of the cells of a line end within one level of the upper quartile. Of meshes behind parked cars 0.64
+to 0.93 did, of flanks 0.17 to 0.55 in most rows."""
 _LINE_ANGLES: Final = 72
 """Directions of lines: a line of 7 m within 1.25° of one of them keeps to a strip of two cells."""
 _MOST_LINES, _MOST_CELLS = 6, 20_000
@@ -118,7 +121,7 @@ def parked_cells(raster: Columns, moving: Bool, bodies: Bodies) -> Int32:
     """
     groups = groups_of(raster, moving, bodies)
     is_vehicle = _are_vehicles(groups)
-    lines = straight_lines(groups, is_vehicle)
+    lines = straight_lines(groups, is_vehicle, raster.top, np.bitwise_count(raster.levels & np.uint32(_BODY)))
     if lines.any():
         groups = groups_of(raster, moving, bodies, lines)
         is_vehicle = _are_vehicles(groups)
@@ -144,8 +147,13 @@ def _are_vehicles(groups: Groups) -> Bool:
     return VEHICLE.probability(groups.features) >= np.where(is_bush, _LEAST_LEAFY, _LEAST)
 
 
-def straight_lines(groups: Groups, which: Bool) -> Bool:
-    """Returns a mask (rows, columns) of the straight lines in some of the groups; which : (k,)."""
+def straight_lines(groups: Groups, which: Bool, top: Int32, levels: npt.NDArray[np.uint8]) -> Bool:
+    """Returns a mask (rows, columns) of the straight lines in some of the groups.
+
+    which : (k,). top, levels : (rows, columns) highest level of each cell, and the number of those of a body that were
+    seen. The flanks of a row of parked cars are no line: bonnets and cabins differ in height, and in the gaps the rims
+    of bumpers are seen at fewer heights than flanks.
+    """
     out = np.zeros(groups.label.shape, np.bool_)
     # a line over the diagonal of its box has that many columns, or rows
     is_long = groups.boxes[:, 2:].max(axis=1, initial=0) >= _LINE_CELLS / math.sqrt(2.0)
@@ -154,12 +162,17 @@ def straight_lines(groups: Groups, which: Bool) -> Bool:
         inside = groups.label[part] == groups.number[k]
         row, column = np.nonzero(inside)
         free, x, y = _at_the_rim(inside)[row, column], column.astype(np.float64), row.astype(np.float64)
+        highest, number = top[part][row, column], levels[part][row, column].astype(np.int64)
         for _ in range(_MOST_LINES if row.size <= _MOST_CELLS else 0):
-            line = np.zeros(row.size, np.bool_)
+            line, whole = np.zeros(row.size, np.bool_), np.zeros(row.size, np.bool_)
             if columns.straight_run(x, y, free, _LINE_ANGLES, _LINE_GAP, line) < _LINE_CELLS:
                 break
             free &= ~line
-            out[part][row[line], column[line]] = True
+            even = np.abs(highest[line] - quantiles(highest[line], [_UPPER])[0]) <= 1.0
+            alike = line & (number >= median(number[line]) - 1.0)
+            length = columns.straight_run(x, y, alike, _LINE_ANGLES, _LINE_GAP, whole)
+            if np.mean(even) >= _EVEN and length >= _LINE_CELLS:
+                out[part][row[line], column[line]] = True
     return out
 
 

@@ -18,6 +18,15 @@ def runs_of(flags: npt.NDArray[np.bool_]) -> npt.NDArray[np.int64]:
     return edges.reshape(-1, 2).astype(np.int64)
 
 
+def without_holes(flags: npt.NDArray[np.bool_], most: int, is_closed: bool = False) -> npt.NDArray[np.bool_]:
+    """Return flags (n,) that are true also in runs of at most so many false ones between true ones.
+
+    is_closed : whether the last of them is followed by the first.
+    """
+    wide = np.pad(flags, most, mode="wrap" if is_closed else "constant")
+    return np.asarray(scipy.ndimage.binary_closing(wide, np.ones(most + 1))[most : most + len(flags)], np.bool_)
+
+
 def way_along(places_m: Float64) -> Float64:
     """Return (n,) horizontal distances (m) from the first of places (n, ≥ 2) along the line through them."""
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(places_m[:, :2], axis=0).T))])

@@ -24,11 +24,11 @@ from typing import Final, Literal
 
 import numpy as np
 import scipy
-from scipy.ndimage import binary_closing, median_filter
+from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from roadscan.compute.array_types import Bool, Float64, Int64
-from roadscan.compute.arrays import runs_of
+from roadscan.compute.arrays import runs_of, without_holes
 from roadscan.core.errors import NavigationError
 from roadscan.core.gpstime import NS_PER_S, iso_from_gps_ns
 from roadscan.core.settings.navigation import SplineConfig
@@ -169,7 +169,7 @@ def rugged_spans(trajectory: Trajectory, config: SplineConfig) -> list[tuple[int
     scatter = _moving_median(np.nan_to_num(surprise), width)
     rugged = scatter > max(config.rugged_factor * usual, config.rugged_m)
     spans = []
-    for a, b in runs_of(_closed(rugged, width)):
+    for a, b in runs_of(without_holes(rugged, width - 1)):
         first, last = max(a - width, 0), min(b + width, surprise.size)
         if _seconds(trajectory, int(first), int(last)) <= config.longest_s:
             spans.append((int(first), int(last)))
@@ -565,8 +565,3 @@ def _moving_median(values: Float64, width: int) -> Float64:
     """Return the median (n,) of `width` values around each."""
     medians: Float64 = median_filter(values, size=width, mode="nearest")
     return medians
-
-
-def _closed(flags: Bool, width: int) -> Bool:
-    """Return flags with holes of up to `width` filled."""
-    return np.asarray(binary_closing(np.pad(flags, width), structure=np.ones(width))[width:-width], dtype=bool)

@@ -13,19 +13,10 @@ from roadscan.assets.make_scene import make_scene
 from roadscan.assets.scene import Box, Returns
 from roadscan.assets.settings import GroundSettings
 from roadscan.simulate import Scene
+from tests.assets.edges.streets import returns_of
 from tests.assets.streets import Street, street
 
 LOW_M = -3.0
-
-
-def returns_of(sensor: np.ndarray, end: np.ndarray) -> Returns:
-    """Returns at places (n, 3) seen from others (n, 3)."""
-    n = len(end)
-    ones, nothing = np.ones(n, np.uint8), np.zeros(n, np.uint8)
-    return Returns(
-        (0.0, 0.0), *end.T.copy(), np.zeros(n, np.float32), np.arange(n), np.ones(n, np.uint16), nothing,
-        np.zeros(n, np.uint16), ones, ones, *sensor.T.copy(),
-    )  # fmt: skip
 
 
 def beside_a_screen(passing: float, imaged: float) -> Returns:
@@ -44,7 +35,7 @@ def beside_a_screen(passing: float, imaged: float) -> Returns:
     away[passes] = (2.0 - LOW_M) / down[passes]
     away[image] += draw.uniform(0.0, 8.0, n)[image]
     end = sensor + np.column_stack([away * np.cos(turn), away * np.sin(turn), -down * away])
-    return returns_of(sensor, end)
+    return returns_of(end, np.zeros(n), np.arange(n), sensor)
 
 
 @pytest.mark.parametrize(("passing", "imaged", "least", "most"), [
@@ -87,19 +78,24 @@ def parked() -> Street:
     return street(two_rows(24.0))
 
 
+def seen_by(parked: Street, passes: tuple[int, ...]) -> tuple[Returns, np.ndarray, np.ndarray, np.ndarray, Box]:
+    """Returns of some passes, what each hit, their stations and offsets, and a window around them."""
+    chosen = np.isin(parked.returns.pass_id, passes)
+    returns, hit = parked.returns.at(chosen), parked.object_id[chosen]
+    xy = np.stack([returns.x_m, returns.y_m])
+    window = Box(*np.floor(xy.min(axis=1)).tolist(), *np.ceil(xy.max(axis=1)).tolist())
+    return returns, hit, *parked.surface.station_offset_m(*(xy.T + returns.corner_m).T), window
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("passes", [(1,), (1, 2)])
 def test_the_road_between_two_rows_of_parked_cars_is_ground(parked: Street, passes: tuple[int, ...]) -> None:
     """The second pass sees what the other sides of the street mirror: images below both fronts lifted the road off."""
-    chosen = np.isin(parked.returns.pass_id, passes)
-    returns, hit = parked.returns.at(chosen), parked.object_id[chosen]
-    x, y = returns.x_m, returns.y_m
-    station, offset = parked.surface.station_offset_m(x + returns.corner_m[0], y + returns.corner_m[1])
-    window = Box(*np.floor([x.min(), y.min()]).tolist(), *np.ceil([x.max(), y.max()]).tolist())
+    returns, hit, station, offset, window = seen_by(parked, passes)
     ground = bare_earth(Place(returns, window, GroundSettings()))
     judged = (station > 2.0) & (station < 22.0) & (hit == 0)
     road = judged & (np.abs(offset) < 2.5)
-    error = ground.model.height_at(x[road], y[road]) - returns.height_m[road]
+    error = ground.model.height_at(returns.x_m[road], returns.y_m[road]) - returns.height_m[road]
     assert ground.on_ground[road].mean() >= 0.999
     assert np.sqrt(np.mean(error**2)) <= 0.02
     sidewalk = judged & (np.abs(offset) > 5.4) & (np.abs(offset) < 8.0)
@@ -110,12 +106,8 @@ def test_the_road_between_two_rows_of_parked_cars_is_ground(parked: Street, pass
 @pytest.mark.slow
 @pytest.mark.parametrize("passes", [(1,), (1, 2)])
 def test_cars_of_a_row_are_vehicles_and_no_fence(parked: Street, passes: tuple[int, ...]) -> None:
-    """By the last rule 13 % of the returns on cars were left over by one pass: their flanks were a line."""
-    chosen = np.isin(parked.returns.pass_id, passes)
-    returns, hit = parked.returns.at(chosen), parked.object_id[chosen]
-    x, y = returns.x_m, returns.y_m
-    station, offset = parked.surface.station_offset_m(x + returns.corner_m[0], y + returns.corner_m[1])
-    window = Box(*np.floor([x.min(), y.min()]).tolist(), *np.ceil([x.max(), y.max()]).tolist())
+    """Flanks that count as lines leave 13 % of the returns on cars over by one pass."""
+    returns, hit, station, offset, window = seen_by(parked, passes)
     drive = parked.drive_xyh_m[np.isin(parked.drive_xyh_m[:, 3], passes)]
     scene = make_scene(returns, window, window, drive)
     car = (hit > 0) & (np.abs(offset) < 5.2) & (station > 2.0) & (station < 22.0) & (scene.above_ground_m > 0.3)

@@ -24,6 +24,7 @@ from roadscan.assets.judgement.judge import Judge
 from roadscan.assets.kernels.columns import mark_corridor
 from roadscan.assets.scene import Scene, once_a_scene
 from roadscan.compute.array_types import Bool, Float64
+from roadscan.compute.arrays import without_holes
 from roadscan.core.extras import cv2
 
 
@@ -120,7 +121,7 @@ def _measured_runs(nodes: Nodes, evidence: Float64, lap: int, settings: EdgeSett
     good &= (high >= settings.seen_high_m) & (_medians_of_five(nodes.step_m, known) >= settings.ratio * scatter)
     good &= _medians_of_five(nodes.step_m, known) <= settings.greatest_step_m
     good &= nodes.covered >= settings.covered
-    whole = scipy.ndimage.binary_closing(np.pad(good, 3), np.ones(5))[3:-3]
+    whole = without_holes(good, 4)
     return [
         Edge(nodes.at(rows), good[rows], evidence[rows], lap=lap if len(rows) == len(good) else 0)
         for rows in runs_along(whole, lap)
@@ -447,9 +448,7 @@ def kerb_parts(edge: Edge, probability: Float64) -> list[Edge]:
     told = np.interp(at, at[edge.seen], probability[edge.seen])
     told[~edge.seen & _both_sides_seen(edge.nodes)] = 0.0
     smooth = scipy.ndimage.uniform_filter1d(told, _SMOOTH_NODES, mode="nearest")
-    good = np.pad(smooth >= LEAST, _HOLE_NODES)
-    whole = scipy.ndimage.binary_closing(good, np.ones(_HOLE_NODES + 1))[_HOLE_NODES:-_HOLE_NODES]
-    return _parts(edge._replace(probability=smooth), whole)
+    return _parts(edge._replace(probability=smooth), without_holes(smooth >= LEAST, _HOLE_NODES))
 
 
 def _both_sides_seen(nodes: Nodes, settings: EdgeSettings = DEFAULT) -> Bool:

@@ -19,7 +19,7 @@ from roadscan.assets.edges.profiles import Nodes
 from roadscan.assets.edges.steps import HeightRaster
 from roadscan.assets.scene import Box, Scene
 from roadscan.compute.array_types import Bool, Float64, Int64
-from roadscan.compute.arrays import scatter_about, way_along
+from roadscan.compute.arrays import scatter_about, way_along, without_holes
 
 NODE_COLUMNS: Final = (
     "easting_m", "northing_m", "height_m", "step_m", "sigma_step_m", "face_m", "scatter_m", "sigma_m", "seen_low",
@@ -419,8 +419,7 @@ def strips_of(
 
 def bridged(line: Line, flags: Bool) -> Bool:
     """Returns flags (n,) of a line's nodes that are true also in holes of 7 m between true ones."""
-    wide = np.pad(flags, HOLE_NODES, mode="wrap" if _is_closed(line) else "constant")
-    return np.asarray(scipy.ndimage.binary_closing(wide, np.ones(HOLE_NODES + 1))[HOLE_NODES:-HOLE_NODES])
+    return without_holes(flags, HOLE_NODES, _is_closed(line))
 
 
 def _is_closed(line: Line) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 import scipy.spatial
 
 from roadscan.compute.array_types import Bool, Float64, Int64
+from roadscan.compute.arrays import runs_of
 
 _SAME_EDGE_M: Final = 0.3
 """Lines this near to one another (m) are one edge if the road lies on the same side of both …"""
@@ -60,7 +61,8 @@ def each_once(edges: Sequence[FoundEdge]) -> list[FoundEdge]:
     for both in _on_one_another(edges):
         # What is gone already takes nothing away: so one of three that lie on one another stays.
         if 2 * np.count_nonzero(free[both.kept][both.kept_nodes]) > len(both.kept_nodes):
-            for nodes in _following(np.unique(both.left_nodes)):
+            left = np.unique(both.left_nodes)
+            for nodes in np.split(left, np.flatnonzero(np.diff(left) > _GAP) + 1):
                 free[both.left][_inner(nodes, free[both.left])] = False
     return [edge.at(rows) for edge, some in zip(edges, free, strict=True) for rows in _runs(some)]
 
@@ -71,15 +73,10 @@ def _inner(nodes: Int64, free: Bool) -> slice:
     return slice(first + (first > 0 and bool(free[first - 1])), last + (last + 1 == free.size or not free[last + 1]))
 
 
-def _following(nodes: Int64) -> list[Int64]:
-    """Returns ascending numbers of nodes, in runs."""
-    return np.split(nodes, np.flatnonzero(np.diff(nodes) > _GAP) + 1)
-
-
 def _runs(free: Bool) -> Iterator[Int64]:
-    for rows in np.split(np.arange(free.size), np.flatnonzero(np.diff(free)) + 1):
-        if free[rows[0]] and len(rows) >= FEWEST:
-            yield rows
+    for first, end in runs_of(free):
+        if end - first >= FEWEST:
+            yield np.arange(first, end)
 
 
 def _on_one_another(edges: Sequence[FoundEdge]) -> list[_Both]:

@@ -11,7 +11,7 @@ import scipy.spatial
 
 from roadscan.assets.edges.profiles import stops
 from roadscan.compute.array_types import Bool, Float64, Int64
-from roadscan.compute.arrays import runs_of, way_along
+from roadscan.compute.arrays import runs_of, way_along, without_holes
 
 STATION_M: Final = 0.5  # Distance of stations along the drive (m).
 _LATTICE_M: Final = 3.0
@@ -63,8 +63,7 @@ def unbroken(driven: Float64) -> list[Float64]:
 
 def bridged(parts: Bool) -> Bool:
     """Returns a mask (n,) of stations where something parts drives, with the gaps between its posts."""
-    width = round(_POSTS_M / STATION_M)
-    return np.asarray(scipy.ndimage.binary_closing(np.pad(parts, width), np.ones(width + 1))[width:-width])
+    return without_holes(parts, round(_POSTS_M / STATION_M))
 
 
 def _moving(places: Float64) -> Float64:

@@ -18,7 +18,7 @@ from roadscan.assets.edges.road_edges import FARTHEST_M, places_across
 from roadscan.assets.kind import AssetKind, AssetObject, Evidence, KindOptions
 from roadscan.assets.scene import Scene
 from roadscan.compute.array_types import Float64
-from roadscan.compute.arrays import way_along
+from roadscan.compute.arrays import way_along, without_holes
 
 STATION_M = 1.0  # Distance of stations along an edge (m).
 GAP_NODES = 6
@@ -84,8 +84,7 @@ def _beside(
     filled = np.column_stack([np.interp(np.arange(len(width)), at, inner[at, i]) for i in range(3)])
     level = np.interp(np.arange(len(width)), at, scipy.ndimage.median_filter(width[at], 5, mode="nearest"))
     wide = good & (level >= settings.least_width_m)
-    closed = scipy.ndimage.binary_closing(np.pad(wide, GAP_NODES), np.ones(GAP_NODES + 1))[GAP_NODES:-GAP_NODES]
-    number, count = scipy.ndimage.label(closed)
+    number, count = scipy.ndimage.label(without_holes(wide, GAP_NODES))
     for k in range(1, count + 1):
         rows = np.flatnonzero(number == k)
         if len(rows) < 2 or (len(rows) - 1) * STATION_M < settings.least_length_m:

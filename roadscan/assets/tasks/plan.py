@@ -129,6 +129,8 @@ class AssetPlan:
     """The survey's tiles that the chosen sensors may have seen."""
     sensors: tuple[str, ...]
     ways: tuple[tuple[str, TrajectorySource], ...]
+    leading: tuple[ReadingSource, ...]
+    """Of each run the sensor whose places are its drive."""
     kinds: tuple[WantedKind, ...]
     common: str
     """Key of what all squares share."""
@@ -167,8 +169,7 @@ class AssetPlan:
         under = dict.fromkeys(t for square in squares for t in grid.tiles_under(square) if t in known)
         own = tuple(sorted(under, key=lambda t: (t.row, t.column)))
         widths = _divergences(self.survey.survey, self.sensors)
-        leading = tuple(_leading(self.survey, self.config).values())
-        return ReturnsTask(grid, squares, self.tiles.task(Block(own)), self.sensors, widths, self.ways, leading)
+        return ReturnsTask(grid, squares, self.tiles.task(Block(own)), self.sensors, widths, self.ways, self.leading)
 
     def near(self, chosen: Sequence[TileId]) -> set[TileId]:
         """Returns squares that see one of some of the survey's tiles, in themselves or in their halo."""
@@ -209,7 +210,8 @@ def plan_assets(plan: SurveyPlan, footprints: FootprintRanges) -> AssetPlan:
         [[w.world, [f.digest for f in w.files], _corrections(plan, run)] for run, w in ways],
         [str(width) for width in _divergences(plan.survey, chosen)],
     )  # fmt: skip
-    own = _looked_at(footprints, config, _leading(plan, config))
+    leading = _leading(plan, config)
+    own = _looked_at(footprints, config, leading)
     tiles = plan_tiles(own, replace(plan, tile_key=common))
     held = TilePlan(plan, own, tiles, (), product_context(plan))
     readings = readings_of(grid, tiles)
@@ -218,7 +220,7 @@ def plan_assets(plan: SurveyPlan, footprints: FootprintRanges) -> AssetPlan:
     together = {square: squares for squares in scenes for square in squares}
     keys = {square: key_of([own_keys[one] for one in together[square]]) for square in readings}
     return AssetPlan(
-        plan, config, grid, held, tuple(chosen), ways, wanted_kinds(config), common, keys, readings, together
+        plan, config, grid, held, tuple(chosen), ways, leading, wanted_kinds(config), common, keys, readings, together
     )
 
 
@@ -286,22 +288,21 @@ def check_assets(survey: Survey) -> None:
             )
 
 
-def _leading(plan: SurveyPlan, config: AssetsConfig) -> dict[str, ReadingSource]:
-    """Returns by run the first of its used sources, by the sensor's name."""
+def _leading(plan: SurveyPlan, config: AssetsConfig) -> tuple[ReadingSource, ...]:
+    """Returns of each run the first of its used sources, by the sensor's name."""
     used = [source for source, _ in plan.sources if is_looked_at(source, config)]
-    return {one.run: one for one in sorted(used, key=lambda s: (s.run, s.sensor, s.table, s.key), reverse=True)}
+    ordered = sorted(used, key=lambda s: (s.run, s.sensor, s.table, s.key), reverse=True)
+    return tuple({one.run: one for one in ordered}.values())
 
 
-def _looked_at(
-    footprints: FootprintRanges, config: AssetsConfig, leading: Mapping[str, ReadingSource]
-) -> FootprintRanges:
+def _looked_at(footprints: FootprintRanges, config: AssetsConfig, leading: Sequence[ReadingSource]) -> FootprintRanges:
     """Returns footprints of the used sources; of their profiles also those that are not road.
 
     Their keys tell the mounting of their run's leading sensor too, which may have no readings there.
     """
     held = np.array([is_looked_at(one.source, config) for one in footprints.slices], bool)
     rows = held[footprints.slice_index] if held.size else np.zeros(0, bool)
-    mounted = {run: asdict(one.adjusted_mountings) for run, one in leading.items()}
+    mounted = {one.run: asdict(one.adjusted_mountings) for one in leading}
     slices = tuple(
         replace(one, source=replace(one.source, road=None, key=key_of(one.source.key, mounted.get(one.source.run))))
         for one in footprints.slices

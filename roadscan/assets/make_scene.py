@@ -6,7 +6,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-import scipy.spatial
 
 from roadscan.assets import classes
 from roadscan.assets.bins import cells_of
@@ -112,11 +111,13 @@ def mark_decks(found: npt.NDArray[np.uint8], returns: Returns, model: GroundMode
     drive = hidden_xyh_m[hidden_xyh_m[:, 2] > model.height_at(hidden_xyh_m[:, 0], hidden_xyh_m[:, 1])]
     if not len(drive):
         return
+    from scipy.spatial import cKDTree
+
     least, most = drive[:, :2].min(axis=0) - ROAD_REACH_M, drive[:, :2].max(axis=0) + ROAD_REACH_M
     from_above = returns.sensor_height_m > returns.height_m
     rows = np.flatnonzero(Box(*least, *most).holds(returns.x_m, returns.y_m) & from_above)
     places = np.column_stack([returns.x_m[rows], returns.y_m[rows]])
-    at = scipy.spatial.cKDTree(drive[:, :2]).query(places, distance_upper_bound=ROAD_REACH_M)[1]
+    at = cKDTree(drive[:, :2]).query(places, distance_upper_bound=ROAD_REACH_M)[1]
     level = np.append(drive[:, 2], np.nan)[at]
     rows = rows[(np.abs(returns.height_m[rows] - level) <= _DECK_M) & np.isin(found[rows], _ON_DECK)]
     grid, shape = (model.x_min_m, model.y_min_m, model.cell_m), model.height_m.shape

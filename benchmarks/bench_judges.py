@@ -1,6 +1,6 @@
 """Kerbs and vehicles on eight hard streets that no judge was fitted to, in memory, with the judges in force.
 
-By these figures it is decided whether a judge that was fitted anew stays (docs/assets.md).
+By these figures it is decided whether a judge that was fitted anew stays (docs/asset-judges.md).
 """
 
 from __future__ import annotations

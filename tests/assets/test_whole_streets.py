@@ -1,4 +1,4 @@
-"""What the stage finds on two whole simulated streets: at least what the manual says (docs/assets.md)."""
+"""What the stage finds on two whole simulated streets: at least what the manual says (docs/asset-figures.md)."""
 
 from __future__ import annotations
 
@@ -54,4 +54,4 @@ def test_probabilities_of_drawn_streets_hold(tmp_path: Path) -> None:
     """The curves were fitted to other streets."""
     objects = judged_streets(HELD_OUT, tmp_path)
     assert len(objects) > 150
-    assert calibration_error(objects) <= 0.05  # 0.035 (docs/assets.md)
+    assert calibration_error(objects) <= 0.05  # 0.035 (docs/asset-figures.md)

@@ -74,8 +74,8 @@ def test_a_wall_becomes_one_region_and_a_bush_none() -> None:
     good = thin_elements(index, moments, 0.25, np.array([6.0, 0.12, 0.06, 0.35]), elements)
     assert good == int(elements[:, 0].sum()) > 30
     np.testing.assert_allclose(np.abs(elements[elements[:, 0] > 0] @ [0, 0, 0, 0.8, 0.6, 0]), 1.0, atol=0.05)
-    region, stack = np.zeros(found, np.int32), np.empty((found, 3), np.int32)
-    number = grow_regions(index, elements, np.cos(0.35), 0.12, np.array([1, 1]), region, stack)
+    region, stack, second = np.zeros(found, np.int32), np.empty((found, 4), np.int32), np.full(found, -1, np.int32)
+    number = grow_regions(index, second, elements, np.cos(0.35), 0.12, np.array([1, 1]), region, stack)
     assert number == 1
     members, starts = np.empty(found, np.int64), np.empty(3, np.int64)
     region_ranges(region, members, starts)

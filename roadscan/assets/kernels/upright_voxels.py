@@ -48,6 +48,19 @@ def gather_moments(x, y, above, corner, sizes, index, moments, voxel_of):
     return found
 
 
+@inlined
+def plane_of(n, x, y, xx, xy, yy):
+    """Returns the upright plane of some returns seen from above, by their sums: middle x and y, direction (its cosine
+    and sine), and standard deviations along and across it.
+    """
+    mx, my = x / n, y / n
+    cxx, cxy, cyy = xx / n - mx * mx, xy / n - mx * my, yy / n - my * my
+    mean, half = 0.5 * (cxx + cyy), math.hypot(0.5 * (cxx - cyy), cxy)
+    angle = 0.5 * math.atan2(2.0 * cxy, cxx - cyy)
+    along, across = math.sqrt(max(mean + half, 0.0)), math.sqrt(max(mean - half, 0.0))
+    return mx, my, math.cos(angle), math.sin(angle), along, across
+
+
 @kernel
 def thin_elements(index, moments, side_m, limits, elements):
     """Find voxels whose returns, with those of the eight beside them in their layer, lie on an upright plane.
@@ -81,13 +94,9 @@ def thin_elements(index, moments, side_m, limits, elements):
                 elements[j] = 0.0
                 if n < limits[0]:
                     continue
-                mx, my = sx / n, sy / n
-                cxx, cxy, cyy = sxx / n - mx * mx, sxy / n - mx * my, syy / n - my * my
-                mean, half = 0.5 * (cxx + cyy), math.hypot(0.5 * (cxx - cyy), cxy)
-                along, across = math.sqrt(max(mean + half, 0.0)), math.sqrt(max(mean - half, 0.0))
-                angle = 0.5 * math.atan2(2.0 * cxy, cxx - cyy)
+                mx, my, cosine, sine, along, across = plane_of(n, sx, sy, sxx, sxy, syy)
                 elements[j, 1], elements[j, 2] = c * side_m + mx, r * side_m + my
-                elements[j, 3], elements[j, 4], elements[j, 5] = math.cos(angle), math.sin(angle), across
+                elements[j, 3], elements[j, 4], elements[j, 5] = cosine, sine, across
                 if along >= limits[1] and across <= limits[2] and across <= limits[3] * along:
                     elements[j, 0] = 1.0
                     good += 1
@@ -106,38 +115,45 @@ def _continue_one_another(elements, i, j, least_cosine, most_m):
 
 
 @kernel
-def grow_regions(index, elements, least_cosine, most_m, reach, region, stack):
+def grow_regions(index, second, elements, least_cosine, most_m, reach, region, stack):
     """Join elements that touch, in and across layers, and lie on one plane; returns the number of regions.
 
-    reach : (layers, cells) that a neighbour may be away; region : (voxels,) int32, all 0, gets the region's number from
-    1, in the order of layers, rows and columns; stack : (voxels, 3) int32, working space.
+    second : (voxels,) int32 number of the other element of a voxel, -1 of most. reach : (layers, cells) that a
+    neighbour may be away; region : (elements,) int32, all 0, gets the region's number from 1, in the order of layers,
+    rows and columns; stack : (elements, 4) int32, working space.
     """
     layers, rows, columns = index.shape
     found = 0
     for k in range(layers):
         for r in range(rows):
             for c in range(columns):
-                seed = index[k, r, c]
-                if seed < 0 or elements[seed, 0] == 0.0 or region[seed] != 0:
+                voxel = index[k, r, c]
+                if voxel < 0:
                     continue
-                found += 1
-                region[seed] = found
-                stack[0, 0], stack[0, 1], stack[0, 2] = k, r, c
-                waiting = 1
-                while waiting > 0:
-                    waiting -= 1
-                    level, row, column = stack[waiting, 0], stack[waiting, 1], stack[waiting, 2]
-                    i = index[level, row, column]
-                    for kk in range(max(level - reach[0], 0), min(level + reach[0] + 1, layers)):
-                        for rr in range(max(row - reach[1], 0), min(row + reach[1] + 1, rows)):
-                            for cc in range(max(column - reach[1], 0), min(column + reach[1] + 1, columns)):
-                                j = index[kk, rr, cc]
-                                if j < 0 or elements[j, 0] == 0.0 or region[j] != 0:
-                                    continue
-                                if _continue_one_another(elements, i, j, least_cosine, most_m):
-                                    region[j] = found
-                                    stack[waiting, 0], stack[waiting, 1], stack[waiting, 2] = kk, rr, cc
-                                    waiting += 1
+                for seed in (voxel, second[voxel]):
+                    if seed < 0 or elements[seed, 0] == 0.0 or region[seed] != 0:
+                        continue
+                    found += 1
+                    region[seed] = found
+                    stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = k, r, c, seed
+                    waiting = 1
+                    while waiting > 0:
+                        waiting -= 1
+                        level, row, column, i = stack[waiting]
+                        for kk in range(max(level - reach[0], 0), min(level + reach[0] + 1, layers)):
+                            for rr in range(max(row - reach[1], 0), min(row + reach[1] + 1, rows)):
+                                for cc in range(max(column - reach[1], 0), min(column + reach[1] + 1, columns)):
+                                    other = index[kk, rr, cc]
+                                    if other < 0:
+                                        continue
+                                    for j in (other, second[other]):
+                                        if j < 0 or elements[j, 0] == 0.0 or region[j] != 0:
+                                            continue
+                                        if _continue_one_another(elements, i, j, least_cosine, most_m):
+                                            region[j] = found
+                                            stack[waiting, 0], stack[waiting, 1] = kk, rr
+                                            stack[waiting, 2], stack[waiting, 3] = cc, j
+                                            waiting += 1
     return found
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from roadscan.assets.bins import in_bins
+from roadscan.assets.kernels.two_faces import ask_for_faces, gather_faces, part_faces
 from roadscan.assets.kernels.upright_voxels import gather_moments, grow_regions, region_ranges, thin_elements
 from roadscan.assets.quantiles import quantiles
 from roadscan.assets.scene import Scene, once_a_scene
@@ -65,16 +66,17 @@ class Region:
 
 @dataclass(frozen=True, eq=False)
 class _Voxels:
-    """Voxels of the returns that may belong to something upright."""
+    """Voxels of the returns that may belong to something upright, and their elements: one, or two faces."""
 
     index: npt.NDArray[np.int32]
-    """(layers, rows, columns) number of a voxel; −1: empty."""
+    """(layers, rows, columns) number of a voxel, and of its element; −1: empty."""
+    second: npt.NDArray[np.int32]
+    """(voxels,) number of the element of a second face; −1: none."""
     elements: Float64
-    """(voxels, 6) as :func:`thin_elements` has them, places from the corner of the voxels."""
-    voxel: npt.NDArray[np.int32]
-    """(n,) voxel of each return; −1: none."""
+    """(elements, 6) as :func:`thin_elements` has them, places from the corner of the voxels."""
+    element: npt.NDArray[np.int32]
+    """(n,) element of each return; −1: none."""
     corner_m: Float64
-    found: int
 
 
 @once_a_scene
@@ -89,37 +91,47 @@ def _voxels(scene: Scene) -> _Voxels:
     corner = np.array([window.x_min_m, window.y_min_m, LOWEST_M])
     sizes = np.array([SIDE_M, LAYER_M])
     found = gather_moments(returns.x_m, returns.y_m, above, corner, sizes, index, moments, voxel)
-    elements = np.zeros((max(found, 1), 6))
+    elements, second = np.zeros((2 * found, 6)), np.full(found, -1, np.int32)
     thin_elements(index, moments, SIDE_M, _LIMITS, elements)
-    return _Voxels(index, elements, voxel, corner, found)
+    asked, normals = np.zeros(found, np.bool_), np.full((found, 2), np.nan)
+    if ask_for_faces(index, moments, SIDE_M, elements, asked, normals):
+        faces, face = np.zeros((2 * found, 6)), np.empty(len(returns), np.int8)
+        x, y, sensor = returns.x_m, returns.y_m, (returns.sensor_x_m, returns.sensor_y_m)
+        gather_faces(x, y, *sensor, voxel, normals, corner, SIDE_M, moments, faces, face)
+        turn = math.cos(math.radians(_TURN_DEG))
+        elements = elements[: part_faces(index, asked, normals, faces, SIDE_M, _LIMITS, turn, elements, second)]
+        on_second = np.flatnonzero((face > 0) & (voxel >= 0))
+        on_second = on_second[second[voxel[on_second]] >= 0]
+        voxel[on_second] = second[voxel[on_second]]
+    return _Voxels(index, second, elements, voxel, corner)
 
 
 def on_thin(scene: Scene) -> Bool:
     """Returns a mask (n,) of the returns in voxels that, with those beside them, lie on an upright plane."""
     v = _voxels(scene)
-    return np.asarray((v.voxel >= 0) & (v.elements[v.voxel, 0] > 0.0))
+    if not len(v.elements):
+        return np.zeros(v.element.size, np.bool_)
+    return np.asarray((v.element >= 0) & (v.elements[v.element, 0] > 0.0))
 
 
 @once_a_scene
 def regions_of(scene: Scene) -> list[Region]:
     """Returns upright surfaces at least 0.7 m long, with pieces on one plane joined over gaps of 1.6 m."""
     seen = _voxels(scene)
-    index, elements, found = seen.index, seen.elements.copy(), seen.found
-    region = np.zeros(max(found, 1), np.int32)
+    elements, count = seen.elements.copy(), len(seen.elements)
+    region, stack = np.zeros(count, np.int32), np.empty((count, 4), np.int32)
     turn = math.cos(math.radians(_TURN_DEG))
-    count = grow_regions(
-        index, elements, turn, _APART_M, np.array([1, 1]), region, np.empty((max(found, 1), 3), np.int32)
-    )
-    members, starts = np.empty(region.size, np.int64), np.empty(count + 2, np.int64)
+    found = grow_regions(seen.index, seen.second, elements, turn, _APART_M, np.array([1, 1]), region, stack)
+    members, starts = np.empty(count, np.int64), np.empty(found + 2, np.int64)
     region_ranges(region, members, starts)
     elements[:, 1:3] += seen.corner_m[:2]
-    groups = [members[starts[k] : starts[k + 1]] for k in range(1, count + 1)]
+    groups = [members[starts[k] : starts[k + 1]] for k in range(1, found + 1)]
     groups = [g for g in groups if g.size >= 3]
     joined = _joined(elements, groups)
-    group_of = np.full(found + 1, -1, np.int32)
+    group_of = np.full(count + 1, -1, np.int32)
     for number, group in enumerate(joined):
         group_of[group] = number
-    first, order = in_bins(group_of[seen.voxel], len(joined))  # voxel −1 is the last entry, which belongs to none
+    first, order = in_bins(group_of[seen.element], len(joined))  # element −1 is the last entry, which belongs to none
     regions = (_region(scene, elements[group], order[first[k] : first[k + 1]]) for k, group in enumerate(joined))
     return [one for one in regions if one is not None]
 

@@ -40,6 +40,10 @@ _AROUND_M, _THIN_M, _SLICE_M = 0.45, 0.1, 0.1
 _SLICES: Final = 15  # So many lie below the greatest height.
 _CLEARLY: Final = 3.0
 """A surface ends where slices hold fewer returns than those below by so many standard deviations of a count."""
+_LEAST_TOP_M: Final = 0.3  # Tops of lower surfaces (m) are not followed: they are of no kind.
+_FACE_M: Final = 0.05  # Returns of a face scatter no more about its line (m).
+_TOP_SLICE_M, _TOP_SLICES = 0.05, 40
+"""The face is followed in slices so high (m), up to 2.15 m above the ground."""
 _MOSTLY: Final = 0.7  # Share of the returns in front of and on the line that lie on it.
 _SHIFTS_M: Final = np.linspace(-0.2, 0.2, 11)  # The line may go on so far beside itself (m).
 _SPREAD_M: Final = 0.04  # Returns of a thin surface scatter no more across it (m).
@@ -154,6 +158,8 @@ def _panel(scene: Scene, region: Region, highest_deg: float) -> Panel | None:
     if count >= 2:
         at_edges[0], at_edges[-1] = 1.5 * middle[0] - 0.5 * middle[1], 1.5 * middle[-1] - 0.5 * middle[-2]
     xy = region.middle_xy_m + edges[:, None] * region.along + at_edges[:, None] * beside
+    centre = (xy[:-1] + xy[1:]) / 2
+    ground = scene.ground.height_at(centre[:, 0], centre[:, 1])
     low, bulk, high = (np.full(count, np.nan) for _ in range(3))
     open_top = np.zeros(count, np.bool_)
     starts, order = in_bins(stretch, count)
@@ -162,19 +168,52 @@ def _panel(scene: Scene, region: Region, highest_deg: float) -> Panel | None:
         if own.size >= 4:
             heights = returns.height_m[own]
             low[k], bulk[k], high[k] = quantiles(heights, [0.02, 0.15, 0.98])
+            high[k] = max(high[k], _top_m(scene, xy[k : k + 2], float(high[k] - ground[k])))
             top = own[np.argmax(heights)]
             flat = math.hypot(returns.x_m[top] - returns.sensor_x_m[top], returns.y_m[top] - returns.sensor_y_m[top])
             rise = float(returns.height_m[top] - returns.sensor_height_m[top])
             open_top[k] = math.degrees(math.atan2(rise, flat)) > highest_deg - _OPEN_DEG
-    centre = (xy[:-1] + xy[1:]) / 2
     none = np.zeros(count, np.int64)
     sensor = float(np.mean(returns.sensor_x_m[rows])), float(np.mean(returns.sensor_y_m[rows]))
     leaves = np.bincount(stretch[np.isin(scene.classes[rows], classes.VEGETATION)], minlength=count)
     return Panel(
-        xy, scene.ground.height_at(centre[:, 0], centre[:, 1]), low, high, bulk,
+        xy, ground, low, high, bulk,
         np.bincount(stretch, minlength=count), none, none, none, none, none, none, open_top, leaves, region.across_m,
         sensor, rows, stretch,
     )  # fmt: skip
+
+
+def _top_m(scene: Scene, ends_m: Float64, above_m: float) -> float:
+    """Returns the height of the upper edge of a stretch (2, 2) of a low surface that goes on above what is known of it
+    (m), whose height above the ground is given; −inf where it does not.
+
+    From above, the top of a wall is seen with its face, so that no plane is thin there. The face goes on, slice by
+    slice, while half as many returns as usual lie on it, and no more lie before it, as of leaves.
+    """
+    returns = scene.returns
+    if not _LEAST_TOP_M <= above_m <= _GARDEN_M:
+        return -math.inf
+    middle, way = ends_m.mean(axis=0), ends_m[1] - ends_m[0]
+    along = way / max(float(np.hypot(*way)), 1e-9)
+    near = places_of(scene).within(float(middle[0]), float(middle[1]), _AROUND_M)
+    t, d = np.empty(near.size), np.empty(near.size)
+    beside_line(returns.x_m, returns.y_m, near, middle, along, t, d)
+    level = np.floor((scene.above_ground_m[near] - LOWEST_M) / _TOP_SLICE_M)
+    here = (np.abs(t) <= _HALF_M / 2) & (level >= 0) & (level < _TOP_SLICES)
+    near, d, level = near[here], d[here], level[here].astype(np.int64)
+    on = np.abs(d) <= _FACE_M
+    if on.sum() < _FEWEST:
+        return -math.inf
+    sensor = np.array([np.mean(returns.sensor_x_m[near[on]]), np.mean(returns.sensor_y_m[near[on]])]) - middle
+    before = d * math.copysign(1.0, float(along[0] * sensor[1] - along[1] * sensor[0])) > _FACE_M
+    mine, others = (np.bincount(level[some], minlength=_TOP_SLICES) for some in (on, before))
+    last = int((above_m - LOWEST_M) / _TOP_SLICE_M)
+    usual = median(mine[:last]) if last else 0.0
+    goes_on = (mine[last + 1 :] >= max(0.5 * usual, 1.0)) & (mine[last + 1 :] >= others[last + 1 :])
+    more = int(np.argmin(np.append(goes_on, False)))
+    if not more:
+        return -math.inf
+    return quantiles(returns.height_m[near[on & (level <= last + more)]], [0.98])[0]
 
 
 def _with_ends(scene: Scene, region: Region) -> Int64:

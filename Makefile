@@ -57,7 +57,7 @@ pytest: $(VENV)/.installed-dev  ## Tests only; PYTEST_ARGS="tests/core -n0" narr
 slow: $(VENV)/.installed-dev  ## The slow tests, most of them whole surveys from log to product: CI runs them after `make test`.
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m "slow and not nightly" $(PYTEST_ARGS)
 
-nightly: $(VENV)/.installed-dev  ## What takes too long for every change: fuzz, power cuts, servers, a second user, benchmarks, no AVX-512.
+nightly: $(VENV)/.installed-dev viewer/dist/index.html  ## What takes too long for every change: fuzz, power cuts, servers, a second user, benchmarks, no AVX-512.
 	$(BIN)/python -m pytest -q -n 2 -m nightly --timeout=1800 $(PYTEST_ARGS)
 
 test-library: export ROADSCAN_CODECS := library

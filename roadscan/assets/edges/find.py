@@ -23,6 +23,7 @@ from roadscan.assets.edges.steps import LEAST_STEP_M, HeightRaster, raster_of, s
 from roadscan.assets.judgement.judge import Judge
 from roadscan.assets.kernels.columns import mark_corridor
 from roadscan.assets.scene import Scene, once_a_scene
+from roadscan.assets.upright.regions import on_thin
 from roadscan.compute.array_types import Bool, Float64
 from roadscan.compute.arrays import without_holes
 from roadscan.core.extras import cv2
@@ -364,7 +365,8 @@ _OTHERS: Final = (
     classes.VEHICLE, classes.PERSON, classes.LOW_NOISE, classes.HIGH_NOISE, classes.LOW_VEGETATION,
     classes.MEDIUM_VEGETATION, classes.HIGH_VEGETATION,
 )  # fmt: skip
-"""Classes that stand at kerbs and are no fence."""
+"""Classes that stand at kerbs and are no fence, but for what lies on an upright plane: a wall that was seen from both
+sides scatters as leaves do."""
 
 
 @once_a_scene
@@ -432,7 +434,8 @@ def _standing(scene: Scene) -> Bool:
     raster, above = raster_of(scene), scene.above_ground_m
     counted = np.ones(256, np.bool_)
     counted[list(_OTHERS)] = False
-    stands = (above > _FENCE_M[0]) & (above < _FENCE_M[1]) & counted[scene.classes] & (raster.cell >= 0)
+    high = (above > _FENCE_M[0]) & (above < _FENCE_M[1]) & (raster.cell >= 0)
+    stands = high & (counted[scene.classes] | on_thin(scene))
     number = np.bincount(raster.cell[stands], minlength=raster.count.size).reshape(raster.count.shape)
     wider = cv2.dilate((number >= _LEAST_RETURNS).astype(np.uint8), np.ones((3, 3), np.uint8))
     return np.asarray(wider > 0)

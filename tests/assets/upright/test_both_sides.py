@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from roadscan.assets.kinds.kerb import Kerb, KerbOptions
 from roadscan.assets.kinds.surfaces import Barrier, Fence, Guardrail, SurfaceKind, Wall
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.scene import Box
@@ -53,3 +54,4 @@ def test_each_face_that_was_seen_is_a_barrier_as_high_as_it_is(driven: Street, p
         assert abs(one.attributes["asset_height_m"] - HEIGHT_M) <= 0.03
         along[face] += one.attributes["length_m"]
     assert min(along.values()) >= 0.95 * LENGTH_M
+    assert Kerb().evidence(scene, KerbOptions()).pieces.num_rows == 0

@@ -67,7 +67,7 @@ def told(chain: Chain) -> Surface | None:
     if chain.porous >= _POROUS and chain.passing >= _LEAST_PASSING and chain.openings >= _POROUS:
         is_fence = top >= 0.6 and chain.length_m >= _LEAST_FENCE_M and chain.passing <= _MOST_PASSING
         return "fence" if is_fence else None
-    if top > 1.25:
+    if chain.median("top_m") > 1.25:
         return "wall" if chain.length_m >= _LEAST_WALL_M else None
     return "barrier" if top >= _LEAST_TOP_M and chain.length_m >= 3.0 else None
 
@@ -173,8 +173,8 @@ class SurfaceKind(AssetKind):
         ground = chain.values["ground_m"]
         height = np.concatenate([ground[:1], (ground[:-1] + ground[1:]) / 2, ground[-1:]])
         line = shapely.LineString(np.column_stack([chain.xy_m, height])).simplify(_SIMPLE_M)
-        values = {"asset_height_m": chain.median("high_m"), "length_m": chain.length_m}
-        return as_object(chain, line, values, math.hypot(_GROUND_SIGMA_M, chain.sigma_median_m("high_m")))
+        values = {"asset_height_m": chain.median("top_m"), "length_m": chain.length_m}
+        return as_object(chain, line, values, math.hypot(_GROUND_SIGMA_M, chain.sigma_median_m("top_m")))
 
 
 def as_object(

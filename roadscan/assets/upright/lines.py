@@ -19,7 +19,7 @@ from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.compute.arrays import SIGMA_OF_MAD
 
 COUNTS: Final = ("returns", "stopped", "passed", "under", "foot", "cells", "open_cells", "leaves")
-STRETCHES: Final = ("ground_m", "low_m", "high_m", "bulk_m", "length_m", *COUNTS, "open_top")
+STRETCHES: Final = ("ground_m", "low_m", "high_m", "top_m", "bulk_m", "length_m", *COUNTS, "open_top")
 PIECE_SCHEMA: Final = pa.schema(
     [("x_m", pa.list_(pa.float64())), ("y_m", pa.list_(pa.float64()))]
     + [(name, pa.list_(pa.float64())) for name in STRETCHES]
@@ -201,7 +201,7 @@ def _row(scene: Scene, panel: Panel, run: list[tuple[int, float, float]]) -> dic
         else {"returns": 0, "passes": [], "first_epoch_gps_ns": None, "last_epoch_gps_ns": None}
     )
     counts = {name: getattr(panel, name)[numbers] * shares for name in COUNTS}
-    heights = {name: getattr(panel, name)[numbers] for name in ("ground_m", "low_m", "high_m", "bulk_m")}
+    heights = {name: getattr(panel, name)[numbers] for name in ("ground_m", "low_m", "high_m", "top_m", "bulk_m")}
     return {
         "x_m": (east + xy[:, 0]).tolist(), "y_m": (north + xy[:, 1]).tolist(),
         **{name: value.tolist() for name, value in (counts | heights).items()},
@@ -339,6 +339,7 @@ def _linked(parts: list[Chain]) -> Chain:
                 "length_m": gap,
                 "low_m": np.nan,
                 "high_m": np.nan,
+                "top_m": np.nan,
                 "bulk_m": np.nan,
             }
             empty["ground_m"] = float((values["ground_m"][-1][-1] + part.values["ground_m"][0]) / 2)

@@ -76,7 +76,9 @@ class Panel:
     low_m: Float64
     """(k,) lower edge: 2 % of the returns lie below; NaN where there are none."""
     high_m: Float64
-    """(k,) upper edge."""
+    """(k,) upper edge of what lies on its plane."""
+    top_m: Float64
+    """(k,) the same, or higher where its face goes on to a top that is seen from above."""
     bulk_m: Float64
     """(k,) height below which 15 % of the returns lie: the posts of a guardrail have fewer."""
     returns: Int64
@@ -160,7 +162,7 @@ def _panel(scene: Scene, region: Region, highest_deg: float) -> Panel | None:
     xy = region.middle_xy_m + edges[:, None] * region.along + at_edges[:, None] * beside
     centre = (xy[:-1] + xy[1:]) / 2
     ground = scene.ground.height_at(centre[:, 0], centre[:, 1])
-    low, bulk, high = (np.full(count, np.nan) for _ in range(3))
+    low, bulk, high, top = (np.full(count, np.nan) for _ in range(4))
     open_top = np.zeros(count, np.bool_)
     starts, order = in_bins(stretch, count)
     for k in range(count):
@@ -168,16 +170,17 @@ def _panel(scene: Scene, region: Region, highest_deg: float) -> Panel | None:
         if own.size >= 4:
             heights = returns.height_m[own]
             low[k], bulk[k], high[k] = quantiles(heights, [0.02, 0.15, 0.98])
-            high[k] = max(high[k], _top_m(scene, xy[k : k + 2], float(high[k] - ground[k])))
-            top = own[np.argmax(heights)]
-            flat = math.hypot(returns.x_m[top] - returns.sensor_x_m[top], returns.y_m[top] - returns.sensor_y_m[top])
-            rise = float(returns.height_m[top] - returns.sensor_height_m[top])
+            top[k] = max(high[k], _top_m(scene, xy[k : k + 2], float(high[k] - ground[k])))
+            last = own[np.argmax(heights)]
+            east, north = returns.x_m[last] - returns.sensor_x_m[last], returns.y_m[last] - returns.sensor_y_m[last]
+            flat = math.hypot(east, north)
+            rise = float(returns.height_m[last] - returns.sensor_height_m[last])
             open_top[k] = math.degrees(math.atan2(rise, flat)) > highest_deg - _OPEN_DEG
     none = np.zeros(count, np.int64)
     sensor = float(np.mean(returns.sensor_x_m[rows])), float(np.mean(returns.sensor_y_m[rows]))
     leaves = np.bincount(stretch[np.isin(scene.classes[rows], classes.VEGETATION)], minlength=count)
     return Panel(
-        xy, ground, low, high, bulk,
+        xy, ground, low, high, top, bulk,
         np.bincount(stretch, minlength=count), none, none, none, none, none, none, open_top, leaves, region.across_m,
         sensor, rows, stretch,
     )  # fmt: skip

@@ -136,6 +136,7 @@ def test_a_house_and_what_goes_on_in_its_line_are_two_things(passed: float, name
         "passed": np.concatenate([0.0 * house, passed * low]), "under": np.zeros(12), "open_top": np.zeros(12),
         "leaves": np.zeros(12), "cells": np.zeros(12), "open_cells": np.zeros(12), "foot": np.zeros(12),
     }  # fmt: skip
+    values["top_m"] = values["high_m"]
     line = np.column_stack([np.arange(13.0), np.zeros(13)])
     chain = Chain(line, values, 0.02, (0.0, 9.0), 600, frozenset({1}), (0, 1))
     assert parts_of(chain) == [("facade", 0, 8), (name, 8, 12)]

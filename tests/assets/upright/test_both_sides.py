@@ -54,4 +54,7 @@ def test_each_face_that_was_seen_is_a_barrier_as_high_as_it_is(driven: Street, p
         assert abs(one.attributes["asset_height_m"] - HEIGHT_M) <= 0.03
         along[face] += one.attributes["length_m"]
     assert min(along.values()) >= 0.95 * LENGTH_M
-    assert Kerb().evidence(scene, KerbOptions()).pieces.num_rows == 0
+    kerb, options = Kerb(), KerbOptions()
+    for one in kerb.objects(kerb.joined(kerb.evidence(scene, options).pieces), options, {}):
+        offset = driven.surface.station_offset_m(*np.array(one.geometry.coords)[:, :2].T)[1]
+        assert np.abs(offset - THICK_M / 2).min() >= 1.0

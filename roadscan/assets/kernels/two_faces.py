@@ -4,18 +4,8 @@ from __future__ import annotations
 
 import math
 
-from roadscan.assets.kernels.upright_voxels import plane_of
-from roadscan.compute.kernel_options import inlined, kernel
-
-
-@inlined
-def _moved(sums, i, a, b):
-    """Returns the first six moments of a row, from a corner that lies (a, b) before its own (m)."""
-    n, x, y = sums[i, 0], sums[i, 1], sums[i, 2]
-    xx = sums[i, 3] + 2.0 * a * x + n * a * a
-    xy = sums[i, 4] + a * y + b * x + n * a * b
-    yy = sums[i, 5] + 2.0 * b * y + n * b * b
-    return n, x + n * a, y + n * b, xx, xy, yy
+from roadscan.assets.kernels.upright_voxels import is_thin, plane_of, with_moments, write_element
+from roadscan.compute.kernel_options import kernel
 
 
 @kernel
@@ -42,15 +32,13 @@ def ask_for_faces(index, moments, side_m, elements, asked, normals):
                     for cc in range(max(c - 1, 0), min(c + 2, columns)):
                         i = index[k, rr, cc]
                         if i >= 0 and math.isnan(normals[i, 0]):
-                            n, x, y, xx, xy, yy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+                            total = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
                             for v in range(max(rr - 2, 0), min(rr + 3, rows)):
                                 for u in range(max(cc - 2, 0), min(cc + 3, columns)):
                                     q = index[k, v, u]
                                     if q >= 0:
-                                        m = _moved(moments, q, (u - cc) * side_m, (v - rr) * side_m)
-                                        n, x, y = n + m[0], x + m[1], y + m[2]
-                                        xx, xy, yy = xx + m[3], xy + m[4], yy + m[5]
-                            plane = plane_of(n, x, y, xx, xy, yy)
+                                        total = with_moments(total, moments, q, (u - cc) * side_m, (v - rr) * side_m)
+                            plane = plane_of(total)
                             normals[i, 0], normals[i, 1] = -plane[3], plane[2]
     return found
 
@@ -101,50 +89,30 @@ def part_faces(index, asked, normals, faces, side_m, limits, least_cosine, eleme
                 j = index[k, r, c]
                 if j < 0 or not asked[j]:
                     continue
-                n0, x0, y0, xx0, xy0, yy0 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-                n1, x1, y1, xx1, xy1, yy1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+                first = other = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
                 for rr in range(max(r - 1, 0), min(r + 2, rows)):
                     for cc in range(max(c - 1, 0), min(c + 2, columns)):
                         i = index[k, rr, cc]
-                        if i < 0:
-                            continue
-                        turned = normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] < 0.0
-                        a, b = (cc - c) * side_m, (rr - r) * side_m
-                        m = _moved(faces, 2 * i + turned, a, b)
-                        n0, x0, y0 = n0 + m[0], x0 + m[1], y0 + m[2]
-                        xx0, xy0, yy0 = xx0 + m[3], xy0 + m[4], yy0 + m[5]
-                        m = _moved(faces, 2 * i + 1 - turned, a, b)
-                        n1, x1, y1 = n1 + m[0], x1 + m[1], y1 + m[2]
-                        xx1, xy1, yy1 = xx1 + m[3], xy1 + m[4], yy1 + m[5]
-                if n0 == 0.0 or n1 == 0.0:
+                        if i >= 0:
+                            turned = normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] < 0.0
+                            a, b = (cc - c) * side_m, (rr - r) * side_m
+                            first = with_moments(first, faces, 2 * i + turned, a, b)
+                            other = with_moments(other, faces, 2 * i + 1 - turned, a, b)
+                if first[0] == 0.0 or other[0] == 0.0:
                     continue
-                one, two = plane_of(n0, x0, y0, xx0, xy0, yy0), plane_of(n1, x1, y1, xx1, xy1, yy1)
-                is_thin, is_thin_too = n0 >= limits[0] and _thin(one, limits), n1 >= limits[0] and _thin(two, limits)
-                if not (is_thin or n0 < limits[0] or one[5] <= limits[2]):
+                one, two = plane_of(first), plane_of(other)
+                thin = first[0] >= limits[0] and is_thin(one, limits)
+                thin_too = other[0] >= limits[0] and is_thin(two, limits)
+                if not (thin or thin_too):
                     continue
-                if not (is_thin_too or n1 < limits[0] or two[5] <= limits[2]) or not (is_thin or is_thin_too):
+                if (first[0] >= limits[0] and one[5] > limits[2]) or (other[0] >= limits[0] and two[5] > limits[2]):
                     continue
-                if is_thin and is_thin_too and abs(one[2] * two[2] + one[3] * two[3]) < least_cosine:
+                if thin and thin_too and abs(one[2] * two[2] + one[3] * two[3]) < least_cosine:
                     continue
                 if (one[0] - two[0]) * normals[j, 0] + (one[1] - two[1]) * normals[j, 1] <= 0.0:
                     continue
-                _write(elements, j, one, is_thin, c * side_m, r * side_m)
-                _write(elements, last, two, is_thin_too, c * side_m, r * side_m)
+                write_element(elements, j, one, thin, c * side_m, r * side_m)
+                write_element(elements, last, two, thin_too, c * side_m, r * side_m)
                 second[j] = last
                 last += 1
     return last
-
-
-@inlined
-def _write(elements, row, plane, is_thin, x, y):
-    """Write the element of a plane, whose middle counts from a corner x, y (m)."""
-    elements[row, 0] = 1.0 if is_thin else 0.0
-    elements[row, 1], elements[row, 2] = x + plane[0], y + plane[1]
-    elements[row, 3], elements[row, 4], elements[row, 5] = plane[2], plane[3], plane[5]
-
-
-@inlined
-def _thin(plane, limits):
-    """Returns whether a plane is long and thin enough."""
-    along, across = plane[4], plane[5]
-    return along >= limits[1] and across <= limits[2] and across <= limits[3] * along

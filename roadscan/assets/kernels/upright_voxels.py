@@ -49,16 +49,45 @@ def gather_moments(x, y, above, corner, sizes, index, moments, voxel_of):
 
 
 @inlined
-def plane_of(n, x, y, xx, xy, yy):
-    """Returns the upright plane of some returns seen from above, by their sums: middle x and y, direction (its cosine
-    and sine), and standard deviations along and across it.
+def with_moments(total, sums, i, a, b):
+    """Returns six sums (n, Σx, Σy, Σx², Σxy, Σy²) with those of a row, whose corner lies (a, b) off theirs (m)."""
+    n, x, y, xx, xy, yy = total
+    m = sums[i, 0]
+    return (
+        n + m, x + (sums[i, 1] + m * a), y + (sums[i, 2] + m * b),
+        xx + (sums[i, 3] + 2.0 * a * sums[i, 1] + m * a * a),
+        xy + (sums[i, 4] + a * sums[i, 2] + b * sums[i, 1] + m * a * b),
+        yy + (sums[i, 5] + 2.0 * b * sums[i, 2] + m * b * b),
+    )  # fmt: skip
+
+
+@inlined
+def plane_of(total):
+    """Returns the upright plane of some returns seen from above, by their six sums: middle x and y, direction (its
+    cosine and sine), and standard deviations along and across it.
     """
+    n, x, y, xx, xy, yy = total
     mx, my = x / n, y / n
     cxx, cxy, cyy = xx / n - mx * mx, xy / n - mx * my, yy / n - my * my
     mean, half = 0.5 * (cxx + cyy), math.hypot(0.5 * (cxx - cyy), cxy)
     angle = 0.5 * math.atan2(2.0 * cxy, cxx - cyy)
     along, across = math.sqrt(max(mean + half, 0.0)), math.sqrt(max(mean - half, 0.0))
     return mx, my, math.cos(angle), math.sin(angle), along, across
+
+
+@inlined
+def is_thin(plane, limits):
+    """Returns whether a plane is long and thin enough for an element; limits : as of `thin_elements`."""
+    along, across = plane[4], plane[5]
+    return along >= limits[1] and across <= limits[2] and across <= limits[3] * along
+
+
+@inlined
+def write_element(elements, row, plane, thin, x, y):
+    """Write the element of a plane, whose middle counts from a corner x, y (m)."""
+    elements[row, 0] = 1.0 if thin else 0.0
+    elements[row, 1], elements[row, 2] = x + plane[0], y + plane[1]
+    elements[row, 3], elements[row, 4], elements[row, 5] = plane[2], plane[3], plane[5]
 
 
 @kernel
@@ -77,29 +106,19 @@ def thin_elements(index, moments, side_m, limits, elements):
                 j = index[k, r, c]
                 if j < 0:
                     continue
-                n, sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+                total = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
                 for rr in range(max(r - 1, 0), min(r + 2, rows)):
                     for cc in range(max(c - 1, 0), min(c + 2, columns)):
                         i = index[k, rr, cc]
-                        if i < 0:
-                            continue
-                        m = moments[i, 0]
-                        a, b = (cc - c) * side_m, (rr - r) * side_m
-                        n += m
-                        sx += moments[i, 1] + m * a
-                        sy += moments[i, 2] + m * b
-                        sxx += moments[i, 3] + 2.0 * a * moments[i, 1] + m * a * a
-                        sxy += moments[i, 4] + a * moments[i, 2] + b * moments[i, 1] + m * a * b
-                        syy += moments[i, 5] + 2.0 * b * moments[i, 2] + m * b * b
+                        if i >= 0:
+                            total = with_moments(total, moments, i, (cc - c) * side_m, (rr - r) * side_m)
                 elements[j] = 0.0
-                if n < limits[0]:
+                if total[0] < limits[0]:
                     continue
-                mx, my, cosine, sine, along, across = plane_of(n, sx, sy, sxx, sxy, syy)
-                elements[j, 1], elements[j, 2] = c * side_m + mx, r * side_m + my
-                elements[j, 3], elements[j, 4], elements[j, 5] = cosine, sine, across
-                if along >= limits[1] and across <= limits[2] and across <= limits[3] * along:
-                    elements[j, 0] = 1.0
-                    good += 1
+                plane = plane_of(total)
+                thin = is_thin(plane, limits)
+                write_element(elements, j, plane, thin, c * side_m, r * side_m)
+                good += thin
     return good
 
 

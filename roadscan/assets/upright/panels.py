@@ -40,7 +40,7 @@ _AROUND_M, _THIN_M, _SLICE_M = 0.45, 0.1, 0.1
 _SLICES: Final = 15  # So many lie below the greatest height.
 _CLEARLY: Final = 3.0
 """A surface ends where slices hold fewer returns than those below by so many standard deviations of a count."""
-_LEAST_TOP_M: Final = 0.3  # Tops of lower surfaces (m) are not followed: they are of no kind.
+_LEAST_TOP_M: Final = 0.3  # Tops of lower stretches (m) are not followed.
 _FACE_M: Final = 0.05  # Returns of a face scatter no more about its line (m).
 _TOP_SLICE_M, _TOP_SLICES = 0.05, 40
 """The face is followed in slices so high (m), up to 2.15 m above the ground."""
@@ -187,11 +187,12 @@ def _panel(scene: Scene, region: Region, highest_deg: float) -> Panel | None:
 
 
 def _top_m(scene: Scene, ends_m: Float64, above_m: float) -> float:
-    """Returns the height of the upper edge of a stretch (2, 2) of a low surface that goes on above what is known of it
-    (m), whose height above the ground is given; −inf where it does not.
+    """Returns the height of the upper edge (m) of a low surface that goes on above what is known; −inf if it does not.
 
     From above, the top of a wall is seen with its face, so that no plane is thin there. The face goes on, slice by
     slice, while half as many returns as usual lie on it, and no more lie before it, as of leaves.
+
+    ends_m : (2, 2) of a stretch. above_m : how high above the ground it is known.
     """
     returns = scene.returns
     if not _LEAST_TOP_M <= above_m <= _GARDEN_M:
@@ -211,8 +212,7 @@ def _top_m(scene: Scene, ends_m: Float64, above_m: float) -> float:
     before = d * math.copysign(1.0, float(along[0] * sensor[1] - along[1] * sensor[0])) > _FACE_M
     mine, others = (np.bincount(level[some], minlength=_TOP_SLICES) for some in (on, before))
     last = int((above_m - LOWEST_M) / _TOP_SLICE_M)
-    usual = median(mine[:last]) if last else 0.0
-    goes_on = (mine[last + 1 :] >= max(0.5 * usual, 1.0)) & (mine[last + 1 :] >= others[last + 1 :])
+    goes_on = (mine[last + 1 :] >= max(0.5 * median(mine[:last]), 1.0)) & (mine[last + 1 :] >= others[last + 1 :])
     more = int(np.argmin(np.append(goes_on, False)))
     if not more:
         return -math.inf

@@ -100,18 +100,15 @@ def _voxels(scene: Scene) -> _Voxels:
         gather_faces(x, y, *sensor, voxel, normals, corner, SIDE_M, moments, faces, face)
         turn = math.cos(math.radians(_TURN_DEG))
         elements = elements[: part_faces(index, asked, normals, faces, SIDE_M, _LIMITS, turn, elements, second)]
-        on_second = np.flatnonzero((face > 0) & (voxel >= 0))
-        on_second = on_second[second[voxel[on_second]] >= 0]
-        voxel[on_second] = second[voxel[on_second]]
+        other = np.append(second, -1)[voxel]  # voxel −1 is the last entry
+        voxel = np.where((face > 0) & (other >= 0), other, voxel).astype(np.int32)
     return _Voxels(index, second, elements, voxel, corner)
 
 
 def on_thin(scene: Scene) -> Bool:
     """Returns a mask (n,) of the returns in voxels that, with those beside them, lie on an upright plane."""
     v = _voxels(scene)
-    if not len(v.elements):
-        return np.zeros(v.element.size, np.bool_)
-    return np.asarray((v.element >= 0) & (v.elements[v.element, 0] > 0.0))
+    return np.append(v.elements[:, 0] > 0.0, False)[v.element]  # element −1 is the last entry
 
 
 @once_a_scene

@@ -491,6 +491,11 @@ def _hang_wires(street: _Street) -> None:
 # --- the survey --------------------------------------------------------------------------------------
 
 
+def survey_of_hard_street(random: np.random.Generator, kind: str, length_m: float, model: str) -> dict[str, Any]:
+    """Return scanner, mounting, speed, passes and errors of a street of a kind; the lidar alone records."""
+    return _survey(_Street(random, kind, length_m), model) | _OFF
+
+
 def _survey(street: _Street, model: str) -> dict[str, Any]:
     """Return scanner, mounting, speed, passes and errors."""
     between, chance = street.between, street.chance

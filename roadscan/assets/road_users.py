@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -23,8 +22,9 @@ from roadscan.assets.moving import (
     sides_m,
     tracks,
 )
-from roadscan.assets.quantiles import median, quantiles
+from roadscan.assets.quantiles import quantiles
 from roadscan.assets.scene import Box, Returns
+from roadscan.assets.straight_lines import Lines, lines_of, straight_lines
 from roadscan.assets.surroundings import Cubes
 from roadscan.compute.array_types import Bool, Float64, Int32
 from roadscan.core.extras import cv2
@@ -48,18 +48,8 @@ _WAIST: Final = 6
 """Level above the body: 1.2 m."""
 _COLUMN_LEVELS: Final = 8
 """A cell in which so many levels are seen is one of a column: a trunk's, a hedge's; a car's sides lean."""
-_LINE_CELLS: Final = 35
-"""A straight run of so many cells (7 m) is a fence, a wall or a hedge, and no part of a vehicle: between two cars of a
-row the side that is seen has a gap."""
-_LINE_GAP: Final = 1
-"""Empty cells that do not end a line: rows of cars have wider gaps."""
-_UPPER, _EVEN = 0.75, 0.6
-"""So large a share of the cells of a line end within one level of the upper quartile. Of meshes behind parked cars 0.64
-to 0.93 did, of flanks 0.17 to 0.55 in most rows."""
-_LINE_ANGLES: Final = 72
-"""Directions of lines: a line of 7 m within 1.25° of one of them keeps to a strip of two cells."""
-_MOST_LINES, _MOST_CELLS = 6, 20_000
-"""Most lines of one group, and cells of the largest group in which they are sought: woods are larger."""
+_ROUNDS: Final = 3
+"""Straight lines are sought so many times: a guard rail, a mesh and a wall may stand before one another."""
 _PLANAR, _LEAFY = 0.5, 0.42
 """Planarity from which a cube is one of a surface, and scattering from which it is one of leaves."""
 _BUSH_M: Final = 1.5
@@ -117,13 +107,19 @@ def road_users(
 def parked_cells(raster: Columns, moving: Bool, bodies: Bodies) -> Int32:
     """Returns the level of parked vehicles, in their cells (rows, columns); 0 elsewhere.
 
-    What stands beside cars may touch them: a vehicle with a straight line is judged once more without it, part by part.
+    What stands beside cars may touch them: a vehicle with straight lines is judged once more without them, part by
+    part, and again, since one line may hide the next.
     """
     groups = groups_of(raster, moving, bodies)
     is_vehicle = _are_vehicles(groups)
-    lines = straight_lines(groups, is_vehicle, raster.top, np.bitwise_count(raster.levels & np.uint32(_BODY)))
-    if lines.any():
-        groups = groups_of(raster, moving, bodies, lines)
+    apart = np.zeros(raster.top.shape, np.bool_)
+    for _ in range(_ROUNDS):
+        lines = lines_in(groups, is_vehicle, raster)
+        if not (others := straight_lines(lines)).any():
+            break
+        mask = lines.mask(others, apart.shape).view(np.uint8)
+        apart |= cv2.dilate(mask, np.ones((3, 3), np.uint8)) > 0  # a mesh scatters into the next cells
+        groups = groups_of(raster, moving, bodies, apart)
         is_vehicle = _are_vehicles(groups)
     found = np.zeros(raster.top.shape, np.int32)
     for k in np.flatnonzero(is_vehicle).tolist():
@@ -147,43 +143,13 @@ def _are_vehicles(groups: Groups) -> Bool:
     return VEHICLE.probability(groups.features) >= np.where(is_bush, _LEAST_LEAFY, _LEAST)
 
 
-def straight_lines(groups: Groups, which: Bool, top: Int32, levels: npt.NDArray[np.uint8]) -> Bool:
-    """Returns a mask (rows, columns) of the straight lines in some of the groups.
-
-    which : (k,). top, levels : (rows, columns) highest level of each cell, and the number of those of a body that were
-    seen. The flanks of a row of parked cars are no line: bonnets and cabins differ in height, and in the gaps the rims
-    of bumpers are seen at fewer heights than flanks.
-    """
-    out = np.zeros(groups.label.shape, np.bool_)
-    # a line over the diagonal of its box has that many columns, or rows
-    is_long = groups.boxes[:, 2:].max(axis=1, initial=0) >= _LINE_CELLS / math.sqrt(2.0)
-    for k in np.flatnonzero(which & is_long).tolist():
+def lines_in(groups: Groups, which: Bool, raster: Columns) -> Lines:
+    """Returns the straight lines in some of the groups; which : (k,)."""
+    cells = []
+    for k in np.flatnonzero(which).tolist():
         part = _part(groups.boxes[k], 0)
-        inside = groups.label[part] == groups.number[k]
-        row, column = np.nonzero(inside)
-        free, x, y = _at_the_rim(inside)[row, column], column.astype(np.float64), row.astype(np.float64)
-        highest, number = top[part][row, column], levels[part][row, column].astype(np.int64)
-        for _ in range(_MOST_LINES if row.size <= _MOST_CELLS else 0):
-            line, whole = np.zeros(row.size, np.bool_), np.zeros(row.size, np.bool_)
-            if columns.straight_run(x, y, free, _LINE_ANGLES, _LINE_GAP, line) < _LINE_CELLS:
-                break
-            free &= ~line
-            even = np.abs(highest[line] - quantiles(highest[line], [_UPPER])[0]) <= 1.0
-            alike = line & (number >= median(number[line]) - 1.0)
-            length = columns.straight_run(x, y, alike, _LINE_ANGLES, _LINE_GAP, whole)
-            if np.mean(even) >= _EVEN and length >= _LINE_CELLS:
-                out[part][row[line], column[line]] = True
-    return out
-
-
-def _at_the_rim(inside: Bool) -> Bool:
-    """Returns the cells of a group with room beside them: no line runs across the roofs of cars that touch each other.
-
-    inside : (rows, columns), and so is what is returned. A hole of one cell in a body is none.
-    """
-    around, rim = np.ones((3, 3), np.uint8), np.pad(inside, 2)
-    body = cv2.morphologyEx(rim.view(np.uint8), cv2.MORPH_CLOSE, around)
-    return np.asarray((rim & (cv2.erode(body, around) == 0))[2:-2, 2:-2])
+        cells.append((groups.label[part] == groups.number[k], part[0].start, part[1].start))
+    return lines_of(cells, raster)
 
 
 def _upper_part(levels: npt.NDArray[np.uint32], free: Bool, body: Bool) -> tuple[Bool, Int32]:

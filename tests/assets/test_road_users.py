@@ -11,7 +11,7 @@ from roadscan.assets.ground.surface import Grid
 from roadscan.assets.kind import asset_kinds
 from roadscan.assets.make_scene import make_scene
 from roadscan.assets.moving import Columns, load_levels, moving_cells
-from roadscan.assets.road_users import Groups, _upper_part, straight_lines
+from roadscan.assets.road_users import _upper_part
 from roadscan.assets.scene import Box, Scene
 from tests.assets.drives import CAR, PERSON, kitti_drive_returns
 
@@ -33,49 +33,6 @@ def test_a_cabin_behind_a_bonnet_belongs_to_its_vehicle_and_a_plate_beside_it_do
     upper, highest = _upper_part(levels, ~body, body)
     assert np.array_equal(upper, cabin)
     assert set(highest[cabin].tolist()) == {11}
-
-
-def test_a_fence_that_touches_a_car_is_a_line_and_no_side_of_a_car_is() -> None:
-    """Cells of 0.2 m: a fence of 9 m, which the mirror of a car touches, of which three sides are seen; a van of 4.4 m
-    by 2 m touches the car. Cars whose bodies are seen all over touch each other.
-    """
-    fence, vehicles = np.zeros((40, 80), np.bool_), np.zeros((40, 80), np.bool_)
-    fence[14, 5:50] = True
-    vehicles[4:13, 10], vehicles[4:13, 31], vehicles[4, 10:32], vehicles[25:35, 32:54] = True, True, True, True
-    vehicles[13, 10] = vehicles[12:25, 31] = True
-    label, box = (fence | vehicles).astype(np.int32), np.array([[5, 4, 49, 31]], np.int32)
-    flat, seen = np.full((40, 80), 6, np.int32), np.full((40, 80), 4, np.uint8)
-    which = np.ones(1, np.bool_)
-    both = Groups(label, np.array([1]), box, np.zeros(1, np.int32), {})
-    lines = straight_lines(both, which, flat, seen)
-    assert lines[fence].all() and np.count_nonzero(lines & vehicles & ~fence) <= 3  # what touches it
-    touching = np.zeros((40, 80), np.bool_)
-    for k in range(
-        4
-    ):  # cars of 3.2 m by 1.8 m side by side, each 1.2 m farther ahead; holes, where roofs were not seen
-        touching[2 + 9 * k : 11 + 9 * k, 20 + 6 * k : 36 + 6 * k] = True
-        touching[4 + 9 * k : 9 + 9 * k : 2, 24 + 6 * k : 32 + 6 * k : 3] = False
-    row = Groups(touching.astype(np.int32), np.array([1]), np.array([[20, 2, 34, 36]]), np.zeros(1, np.int32), {})
-    assert not straight_lines(row, which, flat, seen).any()
-    vehicles[14, 31] = False
-    alone = Groups(vehicles.astype(np.int32), np.array([1]), box, np.zeros(1, np.int32), {})
-    assert not straight_lines(alone, which, flat, seen).any()
-
-
-def test_flanks_of_a_row_of_cars_are_no_line_and_a_low_wall_is() -> None:
-    """Cells of 0.2 m: flanks of 22 cells, 5 apart; between them the rims of bumpers are seen at one height of four."""
-    along = np.arange(76)
-    inside, gap, bonnet = np.zeros((40, 80), np.bool_), along % 27 >= 22, (along % 27 < 6) | (along % 27 >= 18)
-    inside[20, 2:78] = True
-    group = Groups(inside.astype(np.int32), np.array([1]), np.array([[2, 20, 76, 1]]), np.zeros(1, np.int32), {})
-    top, levels = np.full((40, 80), 7, np.int32), np.full((40, 80), 4, np.uint8)
-    which = np.ones(1, np.bool_)
-    assert straight_lines(group, which, top, levels)[inside].all()
-    levels[20, 2:78][gap] = 1
-    assert not straight_lines(group, which, top, levels).any()  # vans: all are as high
-    levels[:] = 4
-    top[20, 2:78][bonnet] = 4
-    assert not straight_lines(group, which, top, levels).any()  # bumper to bumper
 
 
 def drive(scans: slice) -> tuple[Scene, np.ndarray]:

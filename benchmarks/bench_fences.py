@@ -34,9 +34,9 @@ from roadscan.store.store import Store
 
 Float64 = npt.NDArray[np.float64]
 
-SEEN: Final = (*range(800, 809), 811, 813, 819, 822)
-SCORED: Final = (840, 841, 843, 844, 845, 849, 853, 856, 857, 859)
-"""Seeds of hard streets; the latter are the first two of each scanner from 840 on with 20 m of fences or more."""
+SEEN: Final = (*range(800, 809), 811, 813, 819, 822, 841)
+SCORED: Final = (840, 843, 844, 845, 847, 849, 853, 856, 857, 859)
+"""Seeds of hard streets; the latter are the first two of each scanner from 840 on, without 841, with 20 m of fences."""
 _LEAST: Final = 15  # Returns of a metre that is judged.
 _BESIDE_M, _BEFORE_M, _STEP_M = 0.35, 0.6, 0.5
 """A line is found that lies so far beside a place and so far before or beyond it; lines are points so far apart (m)."""

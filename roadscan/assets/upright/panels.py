@@ -20,7 +20,7 @@ from roadscan.assets.upright.slices import places_of
 from roadscan.compute.array_types import Bool, Float64, Int64
 
 STRETCH_M: Final = 1.0  # Length of a stretch (m), about.
-_LINES_PER_M2: Final = 8.0
+_LINES_PER_M2: Final = 32.0
 """About so many sight lines for each square metre of the survey are compared with surfaces."""
 SIGHT_M: Final = 13.0
 """Lines that end farther from a stretch (m) are not counted: squares of any cut see the others."""

@@ -1,7 +1,8 @@
 """Comparison of a home's rows with those it had when it was published or last read: what people changed.
 
 Rows are identified by their id. A row without id that has the number and the geometry, or the number and all values,
-of a row otherwise missing is that row; any other was just drawn. A number alone identifies no row: it is reused.
+of a row otherwise missing is that row, and so is a point with its number within 50 mm of it; any other was just drawn.
+A number alone identifies no row: it is reused.
 """
 
 from __future__ import annotations
@@ -29,6 +30,9 @@ from roadscan.store.asset_schema import GEOMETRY, asset_kind_names, asset_schema
 
 _STEP: Final = 1e-4
 """Tolerance of coordinates (map units): products round to 0.1 mm, and a detour through another CRS costs less."""
+
+_NEAR: Final = 0.05
+"""A point with the number of another, so near to it (map units), is that one: two of a kind do not stand so close."""
 
 
 class Change(NamedTuple):
@@ -160,8 +164,12 @@ def _recovered(side: _Side, ids: list[str | None], place: Mapping[str, int]) -> 
         if one is not None or candidate is None or candidate in present:
             continue
         row, before = side.rows.slice(at, 1), side.before.slice(place[candidate], 1)
-        stands_there = same_place(row[GEOMETRY][0].as_py(), before[GEOMETRY][0].as_py())
-        if stands_there or all(_plain(row[n][0].as_py()) == _plain(before[n][0].as_py()) for n in names):
+        places = row[GEOMETRY][0].as_py(), before[GEOMETRY][0].as_py()
+        if (
+            same_place(*places)
+            or _near(*places)
+            or all(_plain(row[n][0].as_py()) == _plain(before[n][0].as_py()) for n in names)
+        ):
             found[at] = candidate
             present.add(candidate)
     return found
@@ -207,6 +215,14 @@ def same_place(one: bytes | None, other: bytes | None) -> bool:
         return one == other
     first, second = shapely.from_wkb(one), shapely.from_wkb(other)
     return bool(shapely.equals_exact(first, second, tolerance=_STEP)) and _same_heights(first, second)
+
+
+def _near(one: bytes | None, other: bytes | None) -> bool:
+    """Returns True for two points close to each other, seen from above."""
+    if one is None or other is None:
+        return False
+    first, second = shapely.from_wkb(one), shapely.from_wkb(other)
+    return first.geom_type == second.geom_type == "Point" and bool(shapely.distance(first, second) <= _NEAR)
 
 
 def _same_heights(first: Any, second: Any) -> bool:

@@ -144,6 +144,25 @@ def test_an_edit_of_an_asset_whose_drawing_was_undone_is_not_lost(street: Invent
     assert street.conflicts() == []
 
 
+def test_a_drawn_asset_that_was_read_stays_the_same_when_it_is_moved_a_little_and_changed(street: Inventory) -> None:
+    """Its row has no id before the next publish, and neither its place nor its values are those that were read."""
+    file = file_of(street)
+    person.draw(file, "poles", shapely.Point(EAST + 70, NORTH + 4, 103.0), comments="drawn")
+    street.pull(who="eva")
+    before = ids_by_station(street)
+    frame = person.layer(file, "poles")
+    drawn = frame["asset_id"].isna()
+    shapes = [shapely.Point(g.x, g.y - 0.009, g.z) if d else g for g, d in zip(frame.geometry, drawn, strict=True)]
+    frame = frame.set_geometry(shapes, crs=frame.crs)
+    frame.loc[drawn, "condition"] = 4
+    person.replace(file, "poles", frame)
+    street.pull(who="eva")
+    assert ids_by_station(street) == before
+    row = street.state().row(before[-1])
+    assert row["condition"] == 4
+    assert shapely.from_wkb(row["geometry"]).y == pytest.approx(NORTH + 3.991, abs=1e-4)
+
+
 def test_nothing_hangs_on_what_was_rejected(tmp_path: Path) -> None:
     street = inventory(tmp_path, Everywhere())
     rows = [*poles(2), asset("pole", (0.4, 4.0, 100.0)), asset("sign", (0.1, 4.0, 102.5))]

@@ -43,7 +43,7 @@ def hard_street(seed: int) -> Scene:
     nothing: dict[str, list[Any]] = {kind: [] for kind in Roadside.model_fields}
     return Scene.load("urban_street").changed(
         id=f"hard-{seed}", title=f"{street.kind}, {street.length_m:.0f} m", seed=5000 + seed, length_m=street.length_m,
-        road=_road(street), roadside=nothing | street.things, **_survey(street, model), **_OFF,
+        road=_road(street), roadside=nothing | street.things, **_survey(street, model),
     )  # fmt: skip
 
 
@@ -492,12 +492,12 @@ def _hang_wires(street: _Street) -> None:
 
 
 def survey_of_hard_street(random: np.random.Generator, kind: str, length_m: float, model: str) -> dict[str, Any]:
-    """Return scanner, mounting, speed, passes and errors of a street of a kind; the lidar alone records."""
-    return _survey(_Street(random, kind, length_m), model) | _OFF
+    """Return scanner, mounting, speed, passes and errors of a street of a kind."""
+    return _survey(_Street(random, kind, length_m), model)
 
 
 def _survey(street: _Street, model: str) -> dict[str, Any]:
-    """Return scanner, mounting, speed, passes and errors."""
+    """Return scanner, mounting, speed, passes and errors; the lidar alone records."""
     between, chance = street.between, street.chance
     low, high = (12.0, 25.0) if street.kind == "motorway" else (7.0, 14.0)
     a_second = _FIRINGS_A_SECOND[model]
@@ -520,4 +520,5 @@ def _survey(street: _Street, model: str) -> dict[str, Any]:
                   "position_m": between(0.002, 0.02), "attitude_deg": between(0.02, 0.15),
                   "attitude_time_constant_s": 8.0, "time_constant_s": 10.0, "pass_step_m": between(0.01, 0.05),
                   "step_m": between(0.01, 0.05) * chance(0.6), "steps_per_minute": 20.0},
+        **_OFF,
     }  # fmt: skip

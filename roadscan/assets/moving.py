@@ -20,6 +20,8 @@ REACH_M: Final = 8.0
 """A vehicle of 7 m with the ground around it, by which it is told from other things, lies within this (m)."""
 CELL_M: Final = 0.2  # Edge of a cell (m).
 LEVEL_M: Final = 0.2  # Height of a level (m).
+BODY: Final = 0b111100
+"""Levels at which a vehicle has its body, as bits: 0.4–1.2 m."""
 SLOT_NS: Final = 200_000_000
 """Length of a slot of time (ns), counted from the epoch of GPS time: the same for squares of any edge."""
 _WORDS: Final = 4

@@ -11,6 +11,7 @@ from roadscan.assets.judgement.judge import Judge
 from roadscan.assets.kernels import columns
 from roadscan.assets.kernels import cubes as voxels
 from roadscan.assets.moving import (
+    BODY,
     CELL_M,
     LEVEL_M,
     TALL,
@@ -24,7 +25,7 @@ from roadscan.assets.moving import (
 )
 from roadscan.assets.quantiles import quantiles
 from roadscan.assets.scene import Box, Returns
-from roadscan.assets.straight_lines import Lines, lines_of, straight_lines
+from roadscan.assets.straight_lines import Lines, are_no_flanks, lines_of
 from roadscan.assets.surroundings import Cubes
 from roadscan.compute.array_types import Bool, Float64, Int32
 from roadscan.core.extras import cv2
@@ -38,8 +39,6 @@ _LEAST_LEAFY: Final = 0.7
 """The same of a group of the size of a bush that scatters like leaves."""
 _LEAST_CELLS: Final = 6
 """Smaller groups of cells (0.24 m²) are no vehicle."""
-_BODY: Final = 0b111100
-"""Levels at which a vehicle has its body, as bits: 0.4–1.2 m."""
 _BANDS: Final = ((1, 2), (2, 4), (4, 6), (6, 8), (8, 10), (10, 14), (14, 22))
 """Levels of the profile, each from the first up to the second: 0.2–0.4, 0.4–0.8 … 2.8–4.4 m."""
 _CABIN_M: Final = 1.1
@@ -115,7 +114,7 @@ def parked_cells(raster: Columns, moving: Bool, bodies: Bodies) -> Int32:
     apart = np.zeros(raster.top.shape, np.bool_)
     for _ in range(_ROUNDS):
         lines = lines_in(groups, is_vehicle, raster)
-        if not (others := straight_lines(lines)).any():
+        if not (others := are_no_flanks(lines)).any():
             break
         mask = lines.mask(others, apart.shape).view(np.uint8)
         apart |= cv2.dilate(mask, np.ones((3, 3), np.uint8)) > 0  # a mesh scatters into the next cells
@@ -159,7 +158,7 @@ def _upper_part(levels: npt.NDArray[np.uint32], free: Bool, body: Bool) -> tuple
     they touch it and are as wide and long as a cabin; a post and a plate beside a car are narrower.
     """
     highest = np.frexp(levels.astype(np.float64))[1].astype(np.int32) - 1
-    upper = free & ((levels & np.uint32(_BODY)) == 0) & (highest >= _WAIST) & (highest < TALL)
+    upper = free & ((levels & np.uint32(BODY)) == 0) & (highest >= _WAIST) & (highest < TALL)
     _, label = cv2.connectedComponents(upper.view(np.uint8), connectivity=8)
     near = cv2.dilate(body.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
     touching = np.unique(label[near & upper]).tolist()
@@ -173,7 +172,7 @@ def groups_of(raster: Columns, moving: Bool, bodies: Bodies, apart: Bool | None 
     apart (rows, columns) belong to none.
     """
     low = (raster.top >= 1) & (raster.top < TALL) & ~moving
-    body = low & ((raster.levels & np.uint32(_BODY)) > 0)
+    body = low & ((raster.levels & np.uint32(BODY)) > 0)
     held = body if apart is None else body & ~apart
     count, label, boxes, _ = cv2.connectedComponentsWithStats(held.view(np.uint8), connectivity=8)
     label[body & ~held] = count

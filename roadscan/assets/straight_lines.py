@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from roadscan.assets.judgement.judge import Judge
 from roadscan.assets.kernels import columns
-from roadscan.assets.moving import CELL_M, LEVEL_M, TALL, Columns
+from roadscan.assets.moving import BODY, CELL_M, LEVEL_M, TALL, Columns
 from roadscan.assets.quantiles import median, quantiles
 from roadscan.compute.array_types import Bool, Float64
 from roadscan.core.extras import cv2
@@ -28,8 +28,6 @@ _ANGLES: Final = 72
 """Directions of lines: a line of 7 m within 1.25° of one of them keeps to a strip of two cells."""
 _MOST_LINES, _MOST_CELLS = 6, 20_000
 """Most lines of one group, and cells of the largest group in which they are sought: woods are larger."""
-_BODY: Final = 0b111100
-"""Levels at which a vehicle has its body, as bits: 0.4–1.2 m."""
 _UPPER: Final = 0.75
 """Share of the cells of a line that do not end above the level with which the others are compared."""
 _STEP_CELLS: Final = 5
@@ -53,7 +51,7 @@ class Lines(NamedTuple):
         return out
 
 
-def straight_lines(lines: Lines) -> Bool:
+def are_no_flanks(lines: Lines) -> Bool:
     """Returns which lines (k,) are no flanks of vehicles."""
     return LINE.probability(lines.features) >= _LEAST if lines.row else np.zeros(0, np.bool_)
 
@@ -75,10 +73,10 @@ def lines_of(groups: Iterable[tuple[Bool, int, int]], raster: Columns) -> Lines:
 def _runs(inside: Bool) -> list[tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]]:
     """Returns rows and columns of the cells of each straight run of a group (rows, columns)."""
     out: list[tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]] = []
-    row, column = np.nonzero(inside)
     # a line over the diagonal of its box has that many columns, or rows
-    if max(inside.shape) < _LENGTH_CELLS / math.sqrt(2.0) or row.size > _MOST_CELLS:
+    if max(inside.shape) < _LENGTH_CELLS / math.sqrt(2.0) or np.count_nonzero(inside) > _MOST_CELLS:
         return out
+    row, column = np.nonzero(inside)
     free, x, y = _at_the_rim(inside)[row, column], column.astype(np.float64), row.astype(np.float64)
     for _ in range(_MOST_LINES):
         line = np.zeros(row.size, np.bool_)
@@ -112,7 +110,7 @@ def _features(row: npt.NDArray[np.int64], column: npt.NDArray[np.int64], raster:
     return {
         "length_m": float(along.max() + 1.0) * CELL_M, "even": _even(top),
         "even_part": max(_even(part) for part in parts if part.size),
-        "levels": float(median(np.bitwise_count(levels & np.uint32(_BODY)).astype(np.int64))),
+        "levels": float(median(np.bitwise_count(levels & np.uint32(BODY)).astype(np.int64))),
         "levels_seen": float(np.mean(np.bitwise_count(levels & np.uint32((1 << TALL) - 2)) / np.maximum(top, 1))),
         "low_top_m": low, "middle_top_m": middle, "upper_top_m": upper, "high_top_m": high,
     }  # fmt: skip
@@ -124,7 +122,7 @@ def _along(row: npt.NDArray[np.int64], column: npt.NDArray[np.int64]) -> Float64
     Sums of whole numbers are exact, so the bits are the same on each machine.
     """
     x, y, count = column, row, row.size
-    xx, yy = count * (x * x).sum() - x.sum() ** 2, count * (y * y).sum() - y.sum() ** 2
+    xx, yy = (count * (v * v).sum() - v.sum() ** 2 for v in (x, y))
     angle = math.atan2(2.0 * (count * (x * y).sum() - x.sum() * y.sum()), xx - yy) / 2.0
     along = x * math.cos(angle) + y * math.sin(angle)
     return np.asarray(along - along.min())

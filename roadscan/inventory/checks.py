@@ -13,7 +13,7 @@ import numpy.typing as npt
 import shapely
 
 from roadscan.core.witness import Witness
-from roadscan.inventory.comparing import Change, Changes
+from roadscan.inventory.comparing import SAME_PLACE_M, Change, Changes
 from roadscan.inventory.home import EditFault
 from roadscan.inventory.state import State
 from roadscan.store.asset_schema import GEOMETRY, AssetColumn, asset_columns, asset_schema, editable_columns
@@ -244,7 +244,6 @@ _FORMULA: Final = re.compile(r"^[=@\t\r\n＝＋－＠]|^[+-](?![\s\d.,])|^[+-].*
 """Texts that a spreadsheet would run on opening: calls and links to others, but not `+1` or `- leans`."""
 _CONTROL: Final = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f]")
 """Control characters, which no text contains and at which some homes truncate a text."""
-_SAME_PLACE_M: Final = 0.05  # New points nearer than this (m) to an asset of their kind are duplicates.
 _LEAST_HEIGHT_M: Final = 2.0  # Height 0 is a fault where assets around stand higher or lower than this (m).
 
 
@@ -352,7 +351,7 @@ def _doubles(changes: Changes, state: State, unit_m: float) -> Iterator[EditFaul
         else:
             equal = shapely.equals(assets.shapes, shape)
             away = np.where(equal, 0.0, np.inf)
-        near = np.flatnonzero((away <= _SAME_PLACE_M) & (assets.ids != change.asset_id))
+        near = np.flatnonzero((away <= SAME_PLACE_M) & (assets.ids != change.asset_id))
         if near.size:
             other = str(assets.ids[near[0]])
             yield EditFault(asset_schema(change.kind).table, change.record, f"it stands where {other} is: one of them")

@@ -30,9 +30,8 @@ from roadscan.store.asset_schema import GEOMETRY, asset_kind_names, asset_schema
 
 _STEP: Final = 1e-4
 """Tolerance of coordinates (map units): products round to 0.1 mm, and a detour through another CRS costs less."""
-
-_NEAR: Final = 0.05
-"""A point with the number of another, so near to it (map units), is that one: two of a kind do not stand so close."""
+SAME_PLACE_M: Final = 0.05
+"""Two points of a kind do not stand so close to each other (m): the second is the first, or its double."""
 
 
 class Change(NamedTuple):
@@ -90,8 +89,8 @@ def _nullable(schema: pa.Schema) -> pa.Schema:
     return pa.schema([f.with_nullable(True) for f in schema])
 
 
-def compared(content: Content, base: Mapping[str, pa.Table], token: str) -> Changes:
-    """Returns the differences between a home and the rows stored under `token`."""
+def compared(content: Content, base: Mapping[str, pa.Table], token: str, unit_m: float) -> Changes:
+    """Returns the differences between a home, on a map in units of so many metres, and the rows under `token`."""
     changes = Changes()
     homes = {str(one): kind for kind, rows in base.items() for one in rows["asset_id"].to_pylist()}
     for kind in asset_kind_names():
@@ -101,7 +100,7 @@ def compared(content: Content, base: Mapping[str, pa.Table], token: str) -> Chan
         if before is None:
             before = rows.slice(0, 0)
         changes.before[kind] = before
-        _compare_kind(_Side(kind, rows, before, token, homes), changes)
+        _compare_kind(_Side(kind, rows, before, token, homes, unit_m), changes)
     return changes
 
 
@@ -111,6 +110,7 @@ class _Side(NamedTuple):
     before: pa.Table
     token: str
     homes: Mapping[str, str]
+    unit_m: float
 
 
 def _compare_kind(side: _Side, changes: Changes) -> None:
@@ -167,7 +167,7 @@ def _recovered(side: _Side, ids: list[str | None], place: Mapping[str, int]) -> 
         places = row[GEOMETRY][0].as_py(), before[GEOMETRY][0].as_py()
         if (
             same_place(*places)
-            or _near(*places)
+            or _near(*places, side.unit_m)
             or all(_plain(row[n][0].as_py()) == _plain(before[n][0].as_py()) for n in names)
         ):
             found[at] = candidate
@@ -217,12 +217,14 @@ def same_place(one: bytes | None, other: bytes | None) -> bool:
     return bool(shapely.equals_exact(first, second, tolerance=_STEP)) and _same_heights(first, second)
 
 
-def _near(one: bytes | None, other: bytes | None) -> bool:
-    """Returns True for two points close to each other, seen from above."""
+def _near(one: bytes | None, other: bytes | None, unit_m: float) -> bool:
+    """Returns True for two points at one place, seen from above."""
     if one is None or other is None:
         return False
     first, second = shapely.from_wkb(one), shapely.from_wkb(other)
-    return first.geom_type == second.geom_type == "Point" and bool(shapely.distance(first, second) <= _NEAR)
+    return first.geom_type == second.geom_type == "Point" and bool(
+        unit_m * shapely.distance(first, second) <= SAME_PLACE_M
+    )
 
 
 def _same_heights(first: Any, second: Any) -> bool:

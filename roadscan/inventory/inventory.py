@@ -280,7 +280,7 @@ class Inventory:
                 change="undo its deletion, or pull from a copy: an emptied layer would say that all are gone",
                 file=place.name,
             )
-        return mark, compared(content, rows, mark.token or f"commit {mark.commit}"), content
+        return mark, compared(content, rows, mark.token or f"commit {mark.commit}", self.rules.unit_m), content
 
     def _write_project(self) -> None:
         """Write the QGIS project file if there is none yet: people arrange it to their liking."""

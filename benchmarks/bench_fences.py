@@ -1,12 +1,14 @@
-"""Fences and walls in products of hard streets, metre by metre: found, told right, and what is named a fence elsewhere.
+"""Fences, guard rails and walls in products of hard streets, metre by metre: found, and what is named so elsewhere.
 
 Each street is run by ``roadscan run`` with default settings. A metre counts where 15 returns or more show it, and most
-returns at its place are its own. The streets of `SCORED` were never looked at; limits of upright surfaces were set
-while those of `SEEN` were.
+returns at its place are its own. The streets of `SCORED` were never looked at; those of `SEEN` were while limits
+of upright surfaces were set. Judges are fitted to other seeds.
 """
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
@@ -34,9 +36,11 @@ from roadscan.store.store import Store
 
 Float64 = npt.NDArray[np.float64]
 
-SEEN: Final = (*range(800, 809), 811, 813, 819, 822, 841)
-SCORED: Final = (840, 843, 844, 845, 847, 849, 853, 856, 857, 859)
-"""Seeds of hard streets; the latter are the first two of each scanner from 840 on, without 841, with 20 m of fences."""
+SEEN: Final = (*range(800, 809), 811, 813, 819, 822, 840, 841, 843, 844, 845, 847, 849, 853, 856, 857, 859)
+SCORED: Final = (851, 855, 862, 863, 865, 866, 870, 874, 879, 889)
+"""Seeds of hard streets; the latter are the next two of each scanner with 20 m of fences."""
+_JUDGED: Final = ("fence", "gate", "wall", "guardrail")
+_SOLID: Final = ("wall", "barrier", "facade")
 _LEAST: Final = 15  # Returns of a metre that is judged.
 _BESIDE_M, _BEFORE_M, _STEP_M = 0.35, 0.6, 0.5
 """A line is found that lies so far beside a place and so far before or beyond it; lines are points so far apart (m)."""
@@ -46,43 +50,59 @@ _LOWEST_M: Final = 0.3  # Returns higher above the road's foot there (m) show a 
 def figures(folder: Path) -> Iterator[Figure]:
     """Shares of the length, of the streets that were looked at and of those that were only scored."""
     for name, seeds in (("looked at", SEEN), ("only scored", SCORED)):
-        own = bench_folder(folder)
-        total = sum((metres_of(hard_street(seed), own / f"hard-{seed}") for seed in seeds), np.zeros(7))
-        fences, found, walls, told, named, right, lost = total
-        yield Figure(f"{name}: {fences:.0f} m of fences, found", found / fences, "")
-        yield Figure(f"{name}: {named:.0f} m named fence, right", right / named, "")
-        yield Figure(f"{name}: {walls:.0f} m of walls and panels, found solid", told / walls, "")
-        yield Figure(f"{name}: {fences:.0f} m of fences, classed as vehicles for the most part", lost / fences, "")
+        own, total = bench_folder(folder), Counter[str]()
+        for seed in seeds:
+            total += metres_of(hard_street(seed), own / f"hard-{seed}")
+        for kind, words in (("fence", "fences"), ("guardrail", "guard rails")):
+            yield Figure(f"{name}: {total[kind]:.0f} m of {words}, found", _of(total, f"{kind} found", kind), "")
+            yield Figure(f"{name}: {total[f'{kind} named']:.0f} m named {kind}, right",
+                         _of(total, f"{kind} right", f"{kind} named"), "")  # fmt: skip
+        yield Figure(f"{name}: {total['solid']:.0f} m of walls and panels, found solid",
+                     _of(total, "solid found", "solid"), "")  # fmt: skip
+        yield Figure(f"{name}: {total['fence']:.0f} m of fences, classed as vehicles for the most part",
+                     _of(total, "fence lost", "fence"), "")  # fmt: skip
 
 
-def metres_of(street: Street, folder: Path) -> Float64:
-    """Metres (7,): fences, found as such, walls, found solid; named fence, right; fences whose returns are vehicles."""
+def _of(total: Counter[str], part: str, of: str) -> float:
+    return total[part] / total[of] if total[of] else math.nan
+
+
+def metres_of(street: Street, folder: Path) -> Counter[str]:
+    """Metres of fences, guard rails and what is solid, found as such; named so, right; fences classed as vehicles."""
     seen = labelled_returns(street)
     inside, _, station, offset = in_window(seen, street)
     store, surface = _run_of(street, folder), seen.surface
-    lines = {kind: _places(store, surface, kind) for kind in ("fence", "wall", "barrier", "facade")}
+    lines = {kind: _places(store, surface, kind) for kind in ("fence", "guardrail", *_SOLID)}
     points, of_class = _standing(store, surface)
-    own = np.isin(seen.kind[inside], [i for i, k in enumerate(seen.kinds) if k in ("fence", "gate", "wall")])
+    own = np.isin(seen.kind[inside], [i for i, k in enumerate(seen.kinds) if k in _JUDGED])
     side, above = street.roadside, seen.returns.height_m[inside] - surface.height_m(*_map_of(seen.returns.at(inside)))
-    out = np.zeros(7)
-    for one in (*side.fences, *(w for w in side.walls if w.height_m >= 0.55)):
-        is_porous = getattr(one, "style", "panels") != "panels"
-        for metre in np.arange(max(one.start_m, 0.0) + 0.5, min(one.end_m, street.length_m)):
-            band = (np.abs(station - metre) < 0.5) & (np.abs(offset - one.offset_m) < _LOWEST_M) & (above > _LOWEST_M)
-            if own[band].sum() < max(_LEAST, 0.5 * band.sum()):
-                continue
-            near = {kind: _near(places, metre, one.offset_m) for kind, places in lines.items()}
-            if is_porous:
-                beside = (np.abs(points[0] - metre) < 0.5) & (np.abs(points[1] - one.offset_m) < _LOWEST_M)
-                vehicles = beside.any() and (of_class[beside] == classes.VEHICLE).mean() > 0.5
-                out += [1, near["fence"], 0, 0, 0, 0, vehicles]
-            else:
-                out += [0, 0, 1, near["wall"] or near["barrier"] or near["facade"], 0, 0, 0]
-    for at, beside in lines["fence"].T:
-        if 0.0 <= at <= street.length_m:
-            right = any(f.style != "panels" and abs(beside - f.offset_m) < _BESIDE_M
-                        and f.start_m - _BEFORE_M <= at <= f.end_m + _BEFORE_M for f in side.fences)  # fmt: skip
-            out[4:6] += _STEP_M, _STEP_M * right
+    true = {
+        "fence": [f for f in side.fences if f.style != "panels"],
+        "guardrail": side.guardrails,
+        "solid": [*(f for f in side.fences if f.style == "panels"), *(w for w in side.walls if w.height_m >= 0.55)],
+    }
+    out = Counter[str]()
+    for kind, things in true.items():
+        for one in things:
+            for metre in np.arange(max(one.start_m, 0.0) + 0.5, min(one.end_m, street.length_m)):
+                band = (np.abs(station - metre) < 0.5) & (np.abs(offset - one.offset_m) < _LOWEST_M)
+                band &= above > _LOWEST_M
+                if own[band].sum() < max(_LEAST, 0.5 * band.sum()):
+                    continue
+                named = _SOLID if kind == "solid" else (kind,)
+                out[kind] += 1
+                out[f"{kind} found"] += any(_near(lines[n], metre, one.offset_m) for n in named)
+                if kind == "fence":
+                    beside = (np.abs(points[0] - metre) < 0.5) & (np.abs(points[1] - one.offset_m) < _LOWEST_M)
+                    out["fence lost"] += bool(beside.any()) and (of_class[beside] == classes.VEHICLE).mean() > 0.5
+    for kind in ("fence", "guardrail"):
+        for at, beside in lines[kind].T:
+            if 0.0 <= at <= street.length_m:
+                out[f"{kind} named"] += _STEP_M
+                out[f"{kind} right"] += _STEP_M * any(
+                    abs(beside - f.offset_m) < _BESIDE_M and f.start_m - _BEFORE_M <= at <= f.end_m + _BEFORE_M
+                    for f in true[kind]
+                )
     return out
 
 

@@ -87,6 +87,18 @@ def judged_scenes(folder: Path) -> Iterator[JudgedScene]:
 
 def recorded_scenes(folder: Path) -> Iterator[JudgedScene]:
     """Yield the scenes of the recorded street."""
+    table = np.full(256, OTHER, np.uint8)
+    for label, what in _OF_LABEL.items():
+        table[label] = what
+    for scene, label in recorded_views(folder):
+        what = table[label]
+        types = np.zeros(len(what), np.uint8)
+        types[what == TRUNK], types[what == POLE] = SHAFTS.index("tree"), SHAFTS.index("post")
+        yield JudgedScene(scene, what, types, "street", "recorded", _RECORDED)
+
+
+def recorded_views(folder: Path) -> Iterator[tuple[Scene, UInt8]]:
+    """Yield the scenes of the recorded street, with the label of each return (n,)."""
     laid_out(recording_folder(), folder / "sweeps-0-3", range(4))
     sweeps = _sweeps(folder / "sweeps-0-3")
     for number, subset in enumerate(_SUBSETS):
@@ -178,20 +190,14 @@ def _worse(sweeps: Sequence[_Sweep], seed: int) -> list[_Sweep]:
     return out
 
 
-def _recorded(sweeps: Sequence[_Sweep]) -> JudgedScene:
-    """Return the scene of some sweeps."""
-    table = np.full(256, OTHER, np.uint8)
-    for label, what in _OF_LABEL.items():
-        table[label] = what
+def _recorded(sweeps: Sequence[_Sweep]) -> tuple[Scene, UInt8]:
+    """Return the scene of some sweeps, and the label of each return (n,)."""
     window = Box(-_HALF_M, -_HALF_M, _HALF_M, _HALF_M)
     returns, number = _returns(sweeps), np.concatenate([one.label for one in sweeps])
     inside = window.holds(returns.x_m, returns.y_m)
     drive = np.array([[*one.sensor_m, 1.0] for one in sweeps])
     scene = make_scene(returns.at(inside), window, window, drive)
-    what = table[number[inside]]
-    types = np.zeros(len(what), np.uint8)
-    types[what == TRUNK], types[what == POLE] = SHAFTS.index("tree"), SHAFTS.index("post")
-    return JudgedScene(scene, what, types, "street", "recorded", _RECORDED)
+    return scene, number[inside]
 
 
 def _returns(sweeps: Sequence[_Sweep]) -> Returns:

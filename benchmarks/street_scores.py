@@ -23,7 +23,7 @@ Float64 = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 
 ROAD, PARKING, SIDEWALK, MARKING, TERRAIN = 40, 44, 48, 60, 72
-CAR, BUILDING, FENCE, VEGETATION, TRUNK, POLE, SIGN = 10, 50, 51, 70, 71, 80, 81
+CAR, BUILDING, FENCE, STRUCTURE, VEGETATION, TRUNK, POLE, SIGN = 10, 50, 51, 52, 70, 71, 80, 81
 GROUND: Final = (ROAD, PARKING, SIDEWALK, MARKING, TERRAIN)
 NOT_JUDGED: Final = (0, 1, 20, 99, 254, 255)
 ON_GROUND: Final = (classes.GROUND, classes.ROAD, classes.KERB, classes.MARKING, classes.SIDEWALK)
@@ -254,8 +254,8 @@ def judged_objects(street: LabelledStreet) -> list[Judged]:
         for one in street.objects("kerb").itertuples()
         if one.step_m >= _HIGH_M
     ]
-    wanted = {"facade": (BUILDING,), "fence": (FENCE,), "wall": (FENCE, BUILDING, 52), "barrier": (FENCE, 52),
-              "guardrail": (FENCE, 52)}  # fmt: skip
+    wanted = {"facade": (BUILDING,), "fence": (FENCE,), "wall": (FENCE, BUILDING, STRUCTURE),
+              **dict.fromkeys(("barrier", "guardrail"), (FENCE, STRUCTURE))}  # fmt: skip
     for kind, labels in wanted.items():
         for one in street.objects(kind).itertuples():
             share = _share_along(street, one.geometry, labels)

@@ -18,92 +18,86 @@ from roadscan.assets.probabilities import logistic
 from roadscan.assets.scene import Scene, once_a_tile
 from roadscan.assets.upright.lines import PIECE_SCHEMA, Chain, beside, chain_of, chains_of, outline, pieces_of_panels
 from roadscan.assets.upright.panels import SIGHT_M, panels_of
+from roadscan.assets.upright.sorts import JUDGES, probabilities_of
+from roadscan.compute.array_types import Bool
 
 Surface = Literal["facade", "wall", "barrier", "guardrail", "fence"]
 
 _SIMPLE_M: Final = 0.03  # Tolerance of the simplified line (m).
 _GROUND_SIGMA_M: Final = 0.03  # 1 σ of the height of the ground at a surface (m).
-_POROUS: Final = 0.5
-"""A surface is a fence where more than this share of its length lets sight lines through."""
-_HOVERS: Final = 0.05
-"""A surface that begins high above the ground hovers where this share of the sight lines passes below it; elsewhere
-something stands before its foot."""
-_LEAST_FENCE_M, _LEAST_WALL_M = 1.5, 2.5  # Least length of a fence, such as a gate, and of a wall (m).
-_LEAST_PASSING: Final = 0.08  # The uneven top of a wall lets fewer of the sight lines pass than any fence.
-_RAIL_PASSING: Final = 0.5  # What lets more of the sight lines pass is no rail, but a low fence.
+_LEAST_M: Final = {"fence": 1.5, "guardrail": 4.0, "wall": 2.5, "barrier": 3.0, "facade": 2.0}
+"""Least length of each (m): a gate is a fence."""
+_LEAST_TOP_M: Final = {"fence": 0.6, "guardrail": 0.5, "wall": 1.25, "barrier": 0.5}
+"""Least height of each (m)."""
+_LOW_PARTS_M: Final = 2.0  # What begins higher above the ground (m) is a crown, a board or a roof.
+_FREE_M: Final = 0.6
+"""What begins higher above the ground (m) stands on it where its foot is hidden, but not where lines pass below it: a
+handrail of stairs is neither a fence nor a wall."""
 _MOST_PASSING: Final = 0.8  # What lets more of the sight lines pass is no surface: parts of a room, seen through panes.
+_SOLID_PASSING: Final = 0.4  # What lets more of the sight lines pass is no façade.
 _FACADE_M: Final = 3.0  # What is higher is a façade (m), …
 _OPEN_M: Final = 1.4  # … as is what is higher than this (m) and rises beyond what scanners saw.
-_GARDEN_M: Final = 1.6  # What is lower than this (m) is no part of a façade.
-_LEAST_TOP_M: Final = 0.5  # Lower surfaces (m) are of no kind.
-_CHANGE_M: Final = 1.5  # A change of sort along a surface counts as so many metres of another sort.
-_MOST_VEGETATION: Final = 0.5  # Surfaces with a larger share of vegetation are hedges, …
-_THIN_M: Final = 0.035  # … unless they scatter less across their plane (m) …
-_MORE_THAN_LEAVES, _SURE = 0.4, 2.0
-"""… or let a larger share of the sight lines pass, by two standard deviations of their number. On sweeps 0–3 of the
-labelled street hedges scatter by 43 to 55 mm, and let 24 % pass at the most."""
+_CHANGE: Final = 3.0
+"""A change of sort along a surface costs as much as three metres of a sort that is e times less probable."""
+_HIGH: Final = len(JUDGES)
+"""Number of the sort of high stretches; the others are those that judges tell."""
+_SURE: Final = 0.02
+"""Probability of a high sort where a stretch is low, and of a low one where it is high."""
+_SOLID, _FENCE, _RAIL = (list(JUDGES).index(name) for name in ("solid", "fence", "guardrail"))
+_NAMED: Final[dict[int, Surface]] = {_FENCE: "fence", _RAIL: "guardrail"}
 
 
-def told(chain: Chain) -> Surface | None:
-    """Returns the kind of an upright surface; None where it is none of these.
-
-    A façade is solid and rises to 3 m or above what scanners saw; a wall ends lower, a barrier at 1.25 m at the most; a
-    guardrail has free space below its rail; a fence lets sight lines through all along. What begins 2 m above the
-    ground or higher (crowns, boards, roofs), and hedges, are none.
-    """
-    top, low, bulk = chain.median("high_m"), chain.median("low_m"), chain.median("bulk_m")
-    if not np.isfinite(top) or low > 2.0 or chain.length_m < 1.5:
-        return None
-    is_leafy = chain.vegetation > _MOST_VEGETATION and chain.across_m > _THIN_M
-    if is_leafy and not chain.lets_more_through(_MORE_THAN_LEAVES, _SURE):
-        return None
-    if top > _FACADE_M or (top > _OPEN_M and chain.open_top > 0.4):
-        return "facade" if chain.passing < 0.4 and chain.length_m >= 2.0 else None
-    if low > 0.6 and (low > 1.2 or chain.free_below or (chain.hovering > _HOVERS and chain.porous < _POROUS)):
-        return None
-    is_rail = bulk > 0.36 and 0.5 <= top <= 1.15 and top - bulk < 0.5 and chain.passing < _RAIL_PASSING
-    if is_rail and chain.length_m >= 4.0:
-        return "guardrail"
-    if chain.porous >= _POROUS and chain.passing >= _LEAST_PASSING and chain.openings >= _POROUS:
-        is_fence = top >= 0.6 and chain.length_m >= _LEAST_FENCE_M and chain.passing <= _MOST_PASSING
-        return "fence" if is_fence else None
-    if chain.median("top_m") > 1.25:
-        return "wall" if chain.length_m >= _LEAST_WALL_M else None
-    return "barrier" if top >= _LEAST_TOP_M and chain.length_m >= 3.0 else None
+def is_high(chain: Chain) -> Bool:
+    """Returns which stretches (k,) are as high as a façade, or end above what scanners saw."""
+    top = chain.values["high_m"] - chain.values["ground_m"]
+    with np.errstate(invalid="ignore"):
+        return np.asarray((top > _FACADE_M) | ((top > _OPEN_M) & (chain.values["open_top"] > 0.5)))
 
 
 def parts_of(chain: Chain) -> list[tuple[Surface | None, int, int]]:
     """Returns the kinds of the parts of an upright surface, each with its first stretch and the one after its last.
 
-    A house, its gate and its garden wall may stand in one line. So stretches are judged each by itself: high ones,
-    solid ones, ones that let sight lines through, and ones too low for any kind. The sorts along the surface are those
-    that the fewest metres contradict, where each change counts as 1.5 m. Guard rails, whose posts and gaps differ, are
-    judged as a whole.
+    A house, its gate and its garden wall may stand in one line. So judges tell the sort of each stretch; the sorts
+    along the surface are the most probable ones, where each change has its cost.
     """
-    count = chain.values["returns"].size
-    if told(chain) == "guardrail":
-        return [("guardrail", 0, count)]
     sort = _sorts(chain)
     edges = np.flatnonzero(np.concatenate([[True], np.diff(sort) != 0, [True]])).tolist()
     out: list[tuple[Surface | None, int, int]] = []
     for first, last in itertools.pairwise(edges):
-        name = told(chain.part(first, last))
+        name = _named(chain.part(first, last), int(sort[first]))
         begin = out.pop()[1] if out and out[-1][0] == name else first
         out.append((name, begin, last))
     return out
 
 
+def _named(part: Chain, sort: int) -> Surface | None:
+    """Returns the kind of a part of one sort; None where it is none, or too short or low for its kind."""
+    top, low = part.median("high_m"), part.median("low_m")
+    if not np.isfinite(top) or low > _LOW_PARTS_M or part.passing > _MOST_PASSING:
+        return None
+    if sort in (_FENCE, _SOLID) and low > _FREE_M and part.free_below:
+        return None
+    name: Surface | None
+    if sort == _HIGH:
+        name = "facade" if part.passing < _SOLID_PASSING else None
+    elif sort == _SOLID:
+        name = "wall" if part.median("top_m") > _LEAST_TOP_M["wall"] else "barrier"
+    else:
+        name = _NAMED.get(sort)
+    if name is None or part.length_m < _LEAST_M[name]:
+        return None
+    return name if max(top, part.median("top_m")) >= _LEAST_TOP_M.get(name, 0.0) else None
+
+
 def _sorts(chain: Chain) -> npt.NDArray[np.int64]:
     """Returns the sort of each stretch (k,): the cheapest way through their costs (Viterbi 1967)."""
-    top = chain.values["high_m"] - chain.values["ground_m"]
-    known = np.isfinite(top)
-    high = known & ((top > _FACADE_M) | ((top > _OPEN_M) & (chain.values["open_top"] > 0.5)))
-    low, least = known & (top <= _GARDEN_M), known & (top < _LEAST_TOP_M)
-    told_of, through = chain.lets_through()
-    wrong = np.stack([low, high | least | (told_of & through), high | least | (told_of & ~through), known & ~least])
-    costs = (wrong * chain.values["length_m"]).T
-    change = _CHANGE_M * (1.0 - np.eye(len(wrong)))
-    best, back = costs[0], np.zeros((len(costs), len(wrong)), np.int64)
+    high = is_high(chain)
+    share = np.column_stack([probabilities_of(chain), np.full(high.size, _SURE)])
+    share[high] = _SURE
+    share[high, _HIGH] = 1.0
+    costs = -np.log(np.maximum(share, _SURE)) * chain.values["length_m"][:, None]
+    change = _CHANGE * (1.0 - np.eye(_HIGH + 1))
+    best, back = costs[0], np.zeros((len(costs), _HIGH + 1), np.int64)
     for k in range(1, len(costs)):
         ways = best[:, None] + change
         back[k] = ways.argmin(axis=0)

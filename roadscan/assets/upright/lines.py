@@ -18,7 +18,7 @@ from roadscan.assets.upright.slices import places_of
 from roadscan.compute.array_types import Bool, Float64, Int64
 from roadscan.compute.arrays import SIGMA_OF_MAD
 
-COUNTS: Final = ("returns", "stopped", "passed", "under", "foot", "cells", "open_cells", "leaves")
+COUNTS: Final = ("returns", "stopped", "passed", "under", "foot", "columns", "open_columns", "leaves")
 STRETCHES: Final = ("ground_m", "low_m", "high_m", "top_m", "bulk_m", "length_m", *COUNTS, "open_top")
 PIECE_SCHEMA: Final = pa.schema(
     [("x_m", pa.list_(pa.float64())), ("y_m", pa.list_(pa.float64()))]
@@ -78,33 +78,10 @@ class Chain:
         return float(1.2533 * SIGMA_OF_MAD * median(np.abs(above - median(above))) / math.sqrt(above.size))
 
     @property
-    def vegetation(self) -> float:
-        """Returns the share of its returns that are classed as vegetation."""
-        return float(self.values["leaves"].sum()) / max(float(self.values["returns"].sum()), 1.0)
-
-    @property
     def passing(self) -> float:
         """Returns the share of the sight lines at it that pass through."""
         passed, stopped = float(self.values["passed"].sum()), float(self.values["stopped"].sum())
         return passed / max(passed + stopped, 1.0)
-
-    def lets_more_through(self, share: float, sigmas: float) -> bool:
-        """Returns whether more than a share of the sight lines pass, by so many standard deviations of their number."""
-        passed, lines = (
-            float(self.values["passed"].sum()),
-            float((self.values["passed"] + self.values["stopped"]).sum()),
-        )
-        return passed > share * lines + sigmas * math.sqrt(share * (1.0 - share) * lines)
-
-    @property
-    def porous(self) -> float:
-        """Returns the share of its length, where enough sight lines tell it, that lets some of them through.
-
-        A solid surface lets lines through where it has a gap, a porous one all along. One line may be a false return.
-        """
-        told, through = self.lets_through()
-        length = self.values["length_m"] * told
-        return float(length @ through) / float(length.sum()) if told.any() else 0.0
 
     def lets_through(self) -> tuple[Bool, Bool]:
         """Returns which stretches (k,) enough sight lines met to tell, and which of all let some through."""
@@ -118,31 +95,11 @@ class Chain:
         return replace(self, xy_m=self.xy_m[first : last + 1], values=values, seen=round(share * self.seen))
 
     @property
-    def hovering(self) -> float:
-        """Returns the share of the sight lines at it and below it that pass below it."""
-        under, stopped = float(self.values["under"].sum()), float(self.values["stopped"].sum())
-        return under / max(under + stopped, 1.0)
-
-    @property
     def free_below(self) -> bool:
         """Returns whether sight lines pass below it that it would have stopped, a third as dense as it is above."""
         under, foot = float(self.values["under"].sum()), float(self.values["foot"].sum())
         dense = 1.0 - self.passing
         return under * dense >= _TELLING and foot < _SPARSER * dense * (under + foot)
-
-    @property
-    def openings(self) -> float:
-        """Returns the share of its cells, where enough sight lines tell it, that let some through; 1 of none.
-
-        What lets lines through everywhere is porous; a front does so at its doors and windows alone.
-        """
-        told = float(self.values["cells"].sum())
-        return float(self.values["open_cells"].sum()) / told if told else 1.0
-
-    @property
-    def open_top(self) -> float:
-        """Returns the share of its length whose upper edge is higher than scanners saw."""
-        return float(self.values["length_m"] @ self.values["open_top"]) / max(self.length_m, 1e-9)
 
     @property
     def covered(self) -> float:

@@ -54,9 +54,9 @@ _BESIDE_M: Final = 0.2
 """Returns of a region up to this distance beside its line (m) make the surface."""
 _RIM_M: Final = 0.08
 """Sight lines nearer than this to an edge of a surface (m) do not count."""
-_CELLS: Final = 4
-"""A stretch has so many cells along it, and above one another, …"""
-_FEWEST_LINES: Final = 8
+COLUMNS: Final = 4
+"""A stretch has so many columns beside one another, …"""
+LEAST_LINES: Final = 8
 """… each of which so many sight lines tell of: all end by chance on what lets a fifth through in 17 % of the cases."""
 _ABOVE_GROUND_M: Final = 0.12
 """Sight lines below this height above the ground (m) do not tell whether the space below a surface is free."""
@@ -90,10 +90,10 @@ class Panel:
     under: Int64
     foot: Int64
     """(k,) sight lines of the sample that end on its place below its lower edge."""
-    cells: Int64
-    """(k,) quarters of its length and of its height that eight sight lines or more met; `open_cells` is the number of
-    those that let one through."""
-    open_cells: Int64
+    columns: Int64
+    """(k,) quarters of its length that eight sight lines or more met; `open_columns` is the number of those that let
+    one through. Parts of its height do not tell: what rises above the horizon goes on to nothing."""
+    open_columns: Int64
     open_top: Bool
     """(k,) True where the highest laser still meets it: its top is not seen."""
     leaves: Int64
@@ -338,9 +338,9 @@ def _with_sight(scene: Scene, panels: list[Panel]) -> list[Panel]:
         np.column_stack([p.xy_m[:-1], p.xy_m[1:]])[low] for p, low in zip(panels, asked, strict=True)
     )])  # fmt: skip
     bands = np.concatenate([
-        np.zeros((0, _CELLS + 1, 2)), *(_bands(p)[low] for p, low in zip(panels, asked, strict=True)),
+        np.zeros((0, 2, 2)), *(_bands(p)[low] for p, low in zip(panels, asked, strict=True)),
     ])  # fmt: skip
-    found = np.zeros((len(lines), _CELLS, _CELLS + 1), np.int64)
+    found = np.zeros((len(lines), COLUMNS, 2), np.int64)
     passing_lines(
         returns.x_m[some], returns.y_m[some], returns.height_m[some], returns.sensor_x_m[some],
         returns.sensor_y_m[some], returns.sensor_height_m[some], lines, bands, SIGHT_M, found,
@@ -348,15 +348,14 @@ def _with_sight(scene: Scene, panels: list[Panel]) -> list[Panel]:
     out, first = [], 0
     for p, low in zip(panels, asked, strict=True):
         own = slice(first, first + int(low.sum()))
-        through = np.zeros((p.returns.size, _CELLS, _CELLS + 1), np.int64)
-        through[low] = found[own]
+        passed, under = np.zeros((2, p.returns.size, COLUMNS), np.int64)
+        passed[low], under[low] = found[own, :, 0], found[own, :, 1]
         ends = _stopped(scene, p, taken[p.rows])
-        passed = through[..., :_CELLS]
-        told = low[:, None, None] & (passed + ends >= _FEWEST_LINES)
+        told = low[:, None] & (passed + ends >= LEAST_LINES)
         out.append(replace(
-            p, stopped=ends.sum(axis=(1, 2)), passed=passed.sum(axis=(1, 2)), under=through[..., _CELLS].sum(axis=1),
-            cells=told.sum(axis=(1, 2)), open_cells=(told & (passed > 0)).sum(axis=(1, 2)),
-            foot=_at_foot(scene, p, taken, low & (through[..., _CELLS].sum(axis=1) > 0)),
+            p, stopped=ends.sum(axis=1), passed=passed.sum(axis=1), under=under.sum(axis=1),
+            columns=told.sum(axis=1), open_columns=(told & (passed > 0)).sum(axis=1),
+            foot=_at_foot(scene, p, taken, low & (under.sum(axis=1) > 0)),
         ))  # fmt: skip
         first = own.stop
     return out
@@ -379,25 +378,20 @@ def _at_foot(scene: Scene, panel: Panel, taken: Bool, asked: Bool) -> Int64:
 
 
 def _bands(panel: Panel) -> Float64:
-    """Returns the lower and upper edges (k, 5, 2) of the cells above one another, and those of what is below."""
-    share = np.arange(_CELLS + 1) / _CELLS
-    low, high = panel.low_m + _RIM_M, panel.high_m - _RIM_M
-    edge = low[:, None] + share * (high - low)[:, None]
+    """Returns the lower and upper edges (k, 2, 2) of its stretches, and those of what is below them."""
+    own = np.stack([panel.low_m + _RIM_M, panel.high_m - _RIM_M], axis=1)
     below = np.stack([panel.ground_m + _ABOVE_GROUND_M, panel.low_m - _RIM_M], axis=1)
-    return np.concatenate([np.stack([edge[:, :-1], edge[:, 1:]], axis=2), below[:, None]], axis=1)
+    return np.stack([own, below], axis=1)
 
 
 def _stopped(scene: Scene, panel: Panel, taken: Bool) -> Int64:
-    """Returns how many sight lines (k, 4, 4) of the sample end in each cell of its stretches."""
+    """Returns how many sight lines (k, 4) of the sample end in each column of its stretches."""
     rows, stretch = panel.rows[taken], panel.stretch[taken]
     way = np.diff(panel.xy_m, axis=0)
     past = np.column_stack([scene.returns.x_m[rows], scene.returns.y_m[rows]]) - panel.xy_m[stretch]
     along = (past * way[stretch]).sum(axis=1) / np.maximum((way * way).sum(axis=1), 1e-9)[stretch]
-    low, high = (panel.low_m + _RIM_M)[stretch], (panel.high_m - _RIM_M)[stretch]
     height = scene.returns.height_m[rows]
-    between = (height > low) & (height < high)
-    level = (height - low)[between] / (high - low)[between]
-    column, row = ((share * _CELLS).astype(np.int64).clip(0, _CELLS - 1) for share in (along[between], level))
-    count = panel.returns.size * _CELLS * _CELLS
-    cell = (stretch[between].astype(np.int64) * _CELLS + column) * _CELLS + row
-    return np.bincount(cell, minlength=count).reshape(-1, _CELLS, _CELLS)
+    between = (height > (panel.low_m + _RIM_M)[stretch]) & (height < (panel.high_m - _RIM_M)[stretch])
+    column = (along[between] * COLUMNS).astype(np.int64).clip(0, COLUMNS - 1)
+    cell = stretch[between].astype(np.int64) * COLUMNS + column
+    return np.bincount(cell, minlength=panel.returns.size * COLUMNS).reshape(-1, COLUMNS)

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from roadscan.assets import classes
-from roadscan.assets.kinds.surfaces import told
+from roadscan.assets.kinds.surfaces import parts_of
 from roadscan.assets.scene import Box, GroundModel, Returns, Scene
 from roadscan.assets.upright.lines import chain_of
 from roadscan.assets.upright.panels import panels_of
@@ -60,4 +60,4 @@ def test_what_lets_lines_through_everywhere_is_a_fence(
     assert chains
     long = max(chains, key=lambda c: c.length_m)
     assert long.length_m > 0.9 * _LONG_M
-    assert (told(long) == "fence") == is_fence
+    assert ([name for name, _, _ in parts_of(long)] == ["fence"]) == is_fence

@@ -134,7 +134,8 @@ def test_a_house_and_what_goes_on_in_its_line_are_two_things(passed: float, name
         "ground_m": np.zeros(12), "low_m": np.full(12, 0.1), "bulk_m": np.full(12, 0.2), "length_m": np.ones(12),
         "high_m": np.concatenate([6.0 * house, 1.1 * low]), "returns": np.full(12, 50.0), "stopped": np.full(12, 20.0),
         "passed": np.concatenate([0.0 * house, passed * low]), "under": np.zeros(12), "open_top": np.zeros(12),
-        "leaves": np.zeros(12), "cells": np.zeros(12), "open_cells": np.zeros(12), "foot": np.zeros(12),
+        "leaves": np.zeros(12), "columns": np.full(12, 2.0), "foot": np.zeros(12),
+        "open_columns": np.concatenate([0.0 * house, (2.0 if passed else 0.0) * low]),
     }  # fmt: skip
     values["top_m"] = values["high_m"]
     line = np.column_stack([np.arange(13.0), np.zeros(13)])

@@ -8,7 +8,7 @@ of upright surfaces were set. Judges are fitted to other seeds.
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
@@ -50,9 +50,10 @@ _LOWEST_M: Final = 0.3  # Returns higher above the road's foot there (m) show a 
 def figures(folder: Path) -> Iterator[Figure]:
     """Shares of the length, of the streets that were looked at and of those that were only scored."""
     for name, seeds in (("looked at", SEEN), ("only scored", SCORED)):
-        own, total = bench_folder(folder), Counter[str]()
+        own, total = bench_folder(folder), defaultdict[str, float](float)
         for seed in seeds:
-            total += metres_of(hard_street(seed), own / f"hard-{seed}")
+            for what, metres in metres_of(hard_street(seed), own / f"hard-{seed}").items():
+                total[what] += metres
         for kind, words in (("fence", "fences"), ("guardrail", "guard rails")):
             yield Figure(f"{name}: {total[kind]:.0f} m of {words}, found", _of(total, f"{kind} found", kind), "")
             yield Figure(f"{name}: {total[f'{kind} named']:.0f} m named {kind}, right",
@@ -63,11 +64,11 @@ def figures(folder: Path) -> Iterator[Figure]:
                      _of(total, "fence lost", "fence"), "")  # fmt: skip
 
 
-def _of(total: Counter[str], part: str, of: str) -> float:
+def _of(total: dict[str, float], part: str, of: str) -> float:
     return total[part] / total[of] if total[of] else math.nan
 
 
-def metres_of(street: Street, folder: Path) -> Counter[str]:
+def metres_of(street: Street, folder: Path) -> dict[str, float]:
     """Metres of fences, guard rails and what is solid, found as such; named so, right; fences classed as vehicles."""
     seen = labelled_returns(street)
     inside, _, station, offset = in_window(seen, street)
@@ -81,7 +82,7 @@ def metres_of(street: Street, folder: Path) -> Counter[str]:
         "guardrail": side.guardrails,
         "solid": [*(f for f in side.fences if f.style == "panels"), *(w for w in side.walls if w.height_m >= 0.55)],
     }
-    out = Counter[str]()
+    out = defaultdict[str, float](float)
     for kind, things in true.items():
         for one in things:
             for metre in np.arange(max(one.start_m, 0.0) + 0.5, min(one.end_m, street.length_m)):

@@ -47,8 +47,6 @@ _FOOT_M, _HIGHEST_M = 0.25, 3.5
 """Returns between these heights above the ground (m) tell what a stretch is."""
 _BESIDE_M, _LEAST, _MOST = 0.2, 4, 0.6
 """So near to its line (m) lie returns of a stretch, so many at the least, and this share of them are of one sort."""
-_RECORDED_WEIGHT: Final = 1.0
-"""How much a stretch of the recording counts: 18 views show the same street."""
 _PART_M: Final = 20.0
 """Edge of the parts of the recorded street that are held out together (m)."""
 
@@ -61,7 +59,6 @@ class _Shown:
     sort: npt.NDArray[np.int64]
     name: str
     source: str
-    weight: float
 
 
 def segments(folder: Path) -> Iterator[Segments]:
@@ -69,7 +66,7 @@ def segments(folder: Path) -> Iterator[Segments]:
     of_label = np.full(256, _NO_SURFACE)
     of_label[list(NOT_JUDGED)], of_label[FENCE], of_label[[BUILDING, STRUCTURE]] = _UNKNOWN, _FENCE, _SOLID
     for scene, label in recorded_views(folder):
-        yield from _of_scene(_Shown(scene, of_label[label], "street", "recorded", _RECORDED_WEIGHT))
+        yield from _of_scene(_Shown(scene, of_label[label], "street", "recorded"))
     for seed in HARD:
         yield from of_street(hard_street(seed), "hard")
     for seed in PLAIN:
@@ -85,7 +82,7 @@ def of_street(street: Street, source: str) -> Iterator[Segments]:
     seen = labelled_returns(street)
     inside, window, station, offset = in_window(seen, street)
     scene = make_scene(seen.returns.at(inside), window, window, seen.drive_xyh_m)
-    yield from _of_scene(_Shown(scene, _sorts(seen, street, inside, station, offset), street.id, source, 1.0))
+    yield from _of_scene(_Shown(scene, _sorts(seen, street, inside, station, offset), street.id, source))
 
 
 def _sorts(
@@ -117,7 +114,7 @@ def _of_scene(one: _Shown) -> Iterator[Segments]:
             group = np.array(part if one.source == "recorded" else [one.name] * int(keep.sum()), np.str_)
             features = {name: value[keep] for name, value in features_of(chain).items()}
             names = np.array(TYPES)[true[keep]]
-            yield Segments(group, one.source, features, names, one.weight * chain.values["length_m"][keep])
+            yield Segments(group, one.source, features, names, chain.values["length_m"][keep])
 
 
 def _true_of(

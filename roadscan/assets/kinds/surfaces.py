@@ -27,8 +27,9 @@ _SIMPLE_M: Final = 0.03  # Tolerance of the simplified line (m).
 _GROUND_SIGMA_M: Final = 0.03  # 1 σ of the height of the ground at a surface (m).
 _LEAST_M: Final = {"fence": 1.5, "guardrail": 4.0, "wall": 2.5, "barrier": 3.0, "facade": 2.0}
 """Least length of each (m): a gate is a fence."""
-_LEAST_TOP_M: Final = {"fence": 0.6, "guardrail": 0.5, "wall": 1.25, "barrier": 0.5}
+_LEAST_TOP_M: Final = {"fence": 0.6, "guardrail": 0.5, "barrier": 0.5}
 """Least height of each (m)."""
+_WALL_M: Final = 1.25  # A solid surface that is higher (m) is a wall.
 _LOW_PARTS_M: Final = 2.0  # What begins higher above the ground (m) is a crown, a board or a roof.
 _FREE_M: Final = 0.6
 """What begins higher above the ground (m) stands on it where its foot is hidden, but not where lines pass below it: a
@@ -41,8 +42,10 @@ _CHANGE: Final = 3.0
 """A change of sort along a surface costs as much as three metres of a sort that is e times less probable."""
 _HIGH: Final = len(JUDGES)
 """Number of the sort of high stretches; the others are those that judges tell."""
-_SURE: Final = 0.02
-"""Probability of a high sort where a stretch is low, and of a low one where it is high."""
+_GARDEN_M: Final = 1.6  # What is lower than this (m) is no part of a façade.
+_SURE, _MAY_BE = 0.02, 0.25
+"""Least probability of a sort, such as that a low stretch is of a façade; and probability that one between low and high
+is, of which a van or an awning hides a part."""
 _SOLID, _FENCE, _RAIL = (list(JUDGES).index(name) for name in ("solid", "fence", "guardrail"))
 _NAMED: Final[dict[int, Surface]] = {_FENCE: "fence", _RAIL: "guardrail"}
 
@@ -72,7 +75,7 @@ def parts_of(chain: Chain) -> list[tuple[Surface | None, int, int]]:
 
 def _named(part: Chain, sort: int) -> Surface | None:
     """Returns the kind of a part of one sort; None where it is none, or too short or low for its kind."""
-    top, low = part.median("high_m"), part.median("low_m")
+    top, low = part.median("top_m"), part.median("low_m")
     if not np.isfinite(top) or low > _LOW_PARTS_M or part.passing > _MOST_PASSING:
         return None
     if sort in (_FENCE, _SOLID) and low > _FREE_M and part.free_below:
@@ -81,21 +84,22 @@ def _named(part: Chain, sort: int) -> Surface | None:
     if sort == _HIGH:
         name = "facade" if part.passing < _SOLID_PASSING else None
     elif sort == _SOLID:
-        name = "wall" if part.median("top_m") > _LEAST_TOP_M["wall"] else "barrier"
+        name = "wall" if top > _WALL_M else "barrier"
     else:
         name = _NAMED.get(sort)
     if name is None or part.length_m < _LEAST_M[name]:
         return None
-    return name if max(top, part.median("top_m")) >= _LEAST_TOP_M.get(name, 0.0) else None
+    return name if top >= _LEAST_TOP_M.get(name, 0.0) else None
 
 
 def _sorts(chain: Chain) -> npt.NDArray[np.int64]:
     """Returns the sort of each stretch (k,): the cheapest way through their costs (Viterbi 1967)."""
-    high = is_high(chain)
-    share = np.column_stack([probabilities_of(chain), np.full(high.size, _SURE)])
+    high, top = is_high(chain), chain.values["high_m"] - chain.values["ground_m"]
+    known = np.isfinite(top)
+    share = np.column_stack([probabilities_of(chain), np.where(np.nan_to_num(top) > _GARDEN_M, _MAY_BE, _SURE)])
     share[high] = _SURE
     share[high, _HIGH] = 1.0
-    costs = -np.log(np.maximum(share, _SURE)) * chain.values["length_m"][:, None]
+    costs = -np.log(np.maximum(share, _SURE)) * (known * chain.values["length_m"])[:, None]
     change = _CHANGE * (1.0 - np.eye(_HIGH + 1))
     best, back = costs[0], np.zeros((len(costs), _HIGH + 1), np.int64)
     for k in range(1, len(costs)):

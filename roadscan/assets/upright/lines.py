@@ -44,6 +44,7 @@ _LEAST_PASSING: Final = 0.02  # Share of the sight lines that a porous stretch l
 _SPARSER: Final = 1.0 / 3.0  # Below a free one stands so much less than above.
 _TELLING: Final = 5.0
 """Lines that would have been stopped, so many that by chance all pass in 0.7 % of the cases."""
+_LONGEST_STRETCH_M: Final = 1.5  # Surfaces are cut into stretches that are no longer (m).
 _SHORTEST_M: Final = 0.02  # Shorter pieces and gaps are left out (m).
 
 
@@ -302,10 +303,17 @@ def _linked(parts: list[Chain]) -> Chain:
             empty["ground_m"] = float((values["ground_m"][-1][-1] + part.values["ground_m"][0]) / 2)
             for name in STRETCHES:
                 values[name].append(np.array([empty[name]]))
+            tail = part.values
         else:
+            joint = _as_one({n: v[-1][-1] for n, v in values.items()}, {n: v[0] for n, v in part.values.items()})
+            tail = part.values if joint is None else {n: v[1:] for n, v in part.values.items()}
+            if joint is not None:
+                xy[-1] = xy[-1][:-1]
+                for name in STRETCHES:
+                    values[name][-1] = np.append(values[name][-1][:-1], joint[name])
             xy.append(part.xy_m[1:])
         for name in STRETCHES:
-            values[name].append(part.values[name])
+            values[name].append(tail[name])
     weights = np.array([max(p.seen, 1) for p in parts], np.float64)
     weights /= weights.sum()
     epochs = [p.epochs_gps_ns for p in parts if p.seen]
@@ -316,6 +324,14 @@ def _linked(parts: list[Chain]) -> Chain:
         sum(p.seen for p in parts), frozenset().union(*(p.passes for p in parts)),
         (min((e for e, _ in epochs), default=0), max((e for _, e in epochs), default=0)),
     )  # fmt: skip
+
+
+def _as_one(one: dict[str, float], other: dict[str, float]) -> dict[str, float] | None:
+    """Returns the stretch that the border of a square cut in two; None where the ends are two stretches."""
+    if one["length_m"] + other["length_m"] > _LONGEST_STRETCH_M or bool(one["returns"]) != bool(other["returns"]):
+        return None
+    longer = one if one["length_m"] >= other["length_m"] else other
+    return longer | {name: one[name] + other[name] for name in (*COUNTS, "length_m")}
 
 
 _BEFORE_M, _BEHIND_M = 0.4, 1.5

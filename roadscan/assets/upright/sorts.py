@@ -34,7 +34,10 @@ _LEAST_LINES_AROUND, _LEAST_BELOW = 15.0, 5.0
 
 
 def probabilities_of(chain: Chain) -> Float64:
-    """Returns the probability (k, 4) that each stretch of a surface is of each sort, in the order of `JUDGES`."""
+    """Returns the probability (k, 4) that each stretch of a surface is of each sort, in the order of `JUDGES`.
+
+    A stretch without returns is of any of them.
+    """
     features = features_of(chain)
     odds = np.column_stack([judge.probability(features) for judge in JUDGES.values()])
     told: Float64 = odds / odds.sum(axis=1, keepdims=True)

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+import pyarrow as pa
+import pytest
 
-from roadscan.assets.upright.lines import STRETCHES, Chain
+from roadscan.assets.kinds.surfaces import parts_of
+from roadscan.assets.upright.lines import COUNTS, PIECE_SCHEMA, STRETCHES, Chain, chains_of
 from roadscan.assets.upright.sorts import features_of, probabilities_of
 
 Float64 = npt.NDArray[np.float64]
@@ -66,3 +69,39 @@ def test_stretches_that_are_higher_or_lower_are_of_something_else() -> None:
     told = features_of(chain_of(20, passed=passed, high_m=high))
     np.testing.assert_allclose(told["passing_8"], np.repeat([0.0, 100.0 / 260.0], 10))
     np.testing.assert_allclose(told["highest_m"][[0, 10, 19]], [3.0, 3.0, 1.2])
+
+
+@pytest.mark.parametrize(
+    ("top_m", "long_m", "is_one"),
+    [(np.nan, 3.0, True), (2.7, 1.0, True), (2.7, 3.0, True), (1.0, 3.0, False)],
+)
+def test_a_front_goes_on_behind_what_hides_a_part_of_it(top_m: float, long_m: float, is_one: bool) -> None:
+    """Six metres of a front of 6 m, some that are not seen, or only up to a height, and six more."""
+    n = round(long_m)
+    high = 100.0 + np.concatenate([np.full(6, 6.0), np.full(n, top_m), np.full(6, 6.0)])
+    told = parts_of(chain_of(12 + n, high_m=high, top_m=high))
+    assert (told == [("facade", 0, 12 + n)]) == is_one
+
+
+def test_a_stretch_that_the_border_of_a_square_cuts_is_one() -> None:
+    rng = np.random.default_rng(5)
+    whole = chain_of(9, passed=rng.integers(0, 30, 9).astype(float), open_columns=np.full(9, 3.0))
+    for share in (0.05, 0.5, 0.9):
+        at = whole.xy_m[4] + share * (whole.xy_m[5] - whole.xy_m[4])
+        counts = {name: whole.values[name] for name in (*COUNTS, "length_m")}
+        parts = []
+        for own, of, ends in (
+            (slice(0, 5), share, np.concatenate([whole.xy_m[:5], [at]])),
+            (slice(4, 9), 1.0 - share, np.concatenate([[at], whole.xy_m[5:]])),
+        ):
+            values = {name: value[own].copy() for name, value in whole.values.items()}
+            for name in counts:
+                values[name][-1 if own.start == 0 else 0] *= of
+            parts.append({
+                "x_m": ends[:, 0], "y_m": ends[:, 1], **values, "across_m": 0.02, "sensor_x_m": 4.5, "sensor_y_m": 6.0,
+                "seen": 9, "passes": [1], "first_epoch_gps_ns": 0, "last_epoch_gps_ns": 1,
+            })  # fmt: skip
+        (joined,) = chains_of(pa.Table.from_pylist(parts, schema=PIECE_SCHEMA))
+        np.testing.assert_allclose(joined.xy_m, whole.xy_m)
+        for name, value in whole.values.items():
+            np.testing.assert_allclose(joined.values[name], value, err_msg=name)

@@ -313,7 +313,8 @@ def _linked(parts: list[Chain]) -> Chain:
                     values[name][-1] = np.append(values[name][-1][:-1], joint[name])
             xy.append(part.xy_m[1:])
         for name in STRETCHES:
-            values[name].append(tail[name])
+            if tail[name].size:
+                values[name].append(tail[name])
     weights = np.array([max(p.seen, 1) for p in parts], np.float64)
     weights /= weights.sum()
     epochs = [p.epochs_gps_ns for p in parts if p.seen]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
@@ -83,25 +85,21 @@ def test_a_front_goes_on_behind_what_hides_a_part_of_it(top_m: float, long_m: fl
     assert (told == [("facade", 0, 12 + n)]) == is_one
 
 
-def test_a_stretch_that_the_border_of_a_square_cuts_is_one() -> None:
+@pytest.mark.parametrize("shares", [(0.05,), (0.5,), (0.9,), (0.3, 0.7), (0.2, 0.4, 0.9)])
+def test_a_stretch_that_borders_of_squares_cut_is_one(shares: tuple[float, ...]) -> None:
     rng = np.random.default_rng(5)
     whole = chain_of(9, passed=rng.integers(0, 30, 9).astype(float), open_columns=np.full(9, 3.0))
-    for share in (0.05, 0.5, 0.9):
-        at = whole.xy_m[4] + share * (whole.xy_m[5] - whole.xy_m[4])
-        counts = {name: whole.values[name] for name in (*COUNTS, "length_m")}
-        parts = []
-        for own, of, ends in (
-            (slice(0, 5), share, np.concatenate([whole.xy_m[:5], [at]])),
-            (slice(4, 9), 1.0 - share, np.concatenate([[at], whole.xy_m[5:]])),
-        ):
-            values = {name: value[own].copy() for name, value in whole.values.items()}
-            for name in counts:
-                values[name][-1 if own.start == 0 else 0] *= of
-            parts.append({
-                "x_m": ends[:, 0], "y_m": ends[:, 1], **values, "across_m": 0.02, "sensor_x_m": 4.5, "sensor_y_m": 6.0,
-                "seen": 9, "passes": [1], "first_epoch_gps_ns": 0, "last_epoch_gps_ns": 1,
-            })  # fmt: skip
-        (joined,) = chains_of(pa.Table.from_pylist(parts, schema=PIECE_SCHEMA))
-        np.testing.assert_allclose(joined.xy_m, whole.xy_m)
-        for name, value in whole.values.items():
-            np.testing.assert_allclose(joined.values[name], value, err_msg=name)
+    pieces = []
+    for first, last in itertools.pairwise((0.0, *(4.0 + share for share in shares), 9.0)):
+        numbers = np.arange(int(first), int(np.ceil(last)))
+        ends = np.array([first, *numbers[1:].tolist(), last])
+        values = {name: value[numbers] for name, value in whole.values.items()}
+        values |= {name: values[name] * np.diff(ends) for name in (*COUNTS, "length_m")}
+        pieces.append({
+            "x_m": ends, "y_m": np.zeros(ends.size), **values, "across_m": 0.02, "sensor_x_m": 4.5, "sensor_y_m": 6.0,
+            "seen": 9, "passes": [1], "first_epoch_gps_ns": 0, "last_epoch_gps_ns": 1,
+        })  # fmt: skip
+    (joined,) = chains_of(pa.Table.from_pylist(pieces, schema=PIECE_SCHEMA))
+    np.testing.assert_allclose(joined.xy_m, whole.xy_m)
+    for name, value in whole.values.items():
+        np.testing.assert_allclose(joined.values[name], value, err_msg=name)

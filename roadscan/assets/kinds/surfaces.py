@@ -34,6 +34,10 @@ _LOW_PARTS_M: Final = 2.0  # What begins higher above the ground (m) is a crown,
 _FREE_M: Final = 0.6
 """What begins higher above the ground (m) stands on it where its foot is hidden, but not where lines pass below it: a
 handrail of stairs is neither a fence nor a wall."""
+_LEAFY, _THICK_M = 0.9, 0.035
+"""What looks solid is a trimmed hedge where a larger share of its returns is classed as plants, and it is thicker (m,
+1 σ). Held out, that takes 60 m of hedges and 2 m of walls from what is solid on the labelled street, and 30 m of the
+2,282 m of hard streets."""
 _MOST_PASSING: Final = 0.8  # What lets more of the sight lines pass is no surface: parts of a room, seen through panes.
 _SOLID_PASSING: Final = 0.4  # What lets more of the sight lines pass is no façade.
 _FACADE_M: Final = 3.0  # What is higher is a façade (m), …
@@ -79,6 +83,8 @@ def _named(part: Chain, sort: int) -> Surface | None:
     if not np.isfinite(top) or low > _LOW_PARTS_M or part.passing > _MOST_PASSING:
         return None
     if sort in (_FENCE, _SOLID) and low > _FREE_M and part.free_below:
+        return None
+    if sort == _SOLID and part.leaves > _LEAFY and part.across_m > _THICK_M:
         return None
     name: Surface | None
     if sort == _HIGH:

@@ -96,6 +96,11 @@ class Chain:
         return replace(self, xy_m=self.xy_m[first : last + 1], values=values, seen=round(share * self.seen))
 
     @property
+    def leaves(self) -> float:
+        """Returns the share of its returns that are classed as vegetation."""
+        return float(self.values["leaves"].sum()) / max(float(self.values["returns"].sum()), 1.0)
+
+    @property
     def free_below(self) -> bool:
         """Returns whether sight lines pass below it that it would have stopped, a third as dense as it is above."""
         under, foot = float(self.values["under"].sum()), float(self.values["foot"].sum())

@@ -83,19 +83,21 @@ def metres_of(street: Street, folder: Path) -> dict[str, float]:
         "solid": [*(f for f in side.fences if f.style == "panels"), *(w for w in side.walls if w.height_m >= 0.55)],
     }
     out = defaultdict[str, float](float)
-    for kind, things in true.items():
-        for one in things:
-            for metre in np.arange(max(one.start_m, 0.0) + 0.5, min(one.end_m, street.length_m)):
-                band = (np.abs(station - metre) < 0.5) & (np.abs(offset - one.offset_m) < _LOWEST_M)
-                band &= above > _LOWEST_M
-                if own[band].sum() < max(_LEAST, 0.5 * band.sum()):
-                    continue
-                named = _SOLID if kind == "solid" else (kind,)
-                out[kind] += 1
-                out[f"{kind} found"] += any(_near(lines[n], metre, one.offset_m) for n in named)
-                if kind == "fence":
-                    beside = (np.abs(points[0] - metre) < 0.5) & (np.abs(points[1] - one.offset_m) < _LOWEST_M)
-                    out["fence lost"] += bool(beside.any()) and (of_class[beside] == classes.VEHICLE).mean() > 0.5
+    every = [
+        (kind, one.offset_m, metre)
+        for kind, things in true.items()
+        for one in things
+        for metre in np.arange(max(one.start_m, 0.0) + 0.5, min(one.end_m, street.length_m))
+    ]
+    for kind, offset_m, metre in every:
+        band = (np.abs(station - metre) < 0.5) & (np.abs(offset - offset_m) < _LOWEST_M) & (above > _LOWEST_M)
+        if own[band].sum() < max(_LEAST, 0.5 * band.sum()):
+            continue
+        out[kind] += 1
+        out[f"{kind} found"] += any(_near(lines[n], metre, offset_m) for n in (_SOLID if kind == "solid" else (kind,)))
+        if kind == "fence":
+            beside = (np.abs(points[0] - metre) < 0.5) & (np.abs(points[1] - offset_m) < _LOWEST_M)
+            out["fence lost"] += bool(beside.any()) and (of_class[beside] == classes.VEHICLE).mean() > 0.5
     for kind in ("fence", "guardrail"):
         for at, beside in lines[kind].T:
             if 0.0 <= at <= street.length_m:

@@ -12,10 +12,10 @@ import pyarrow as pa
 from roadscan.assets.kernels.columns import mark_strip
 from roadscan.assets.quantiles import median
 from roadscan.assets.scene import Box, Scene
-from roadscan.assets.upright.panels import Panel
+from roadscan.assets.upright.panels import STRETCH_M, Panel
 from roadscan.assets.upright.pieces import seen_by
 from roadscan.assets.upright.slices import places_of
-from roadscan.compute.array_types import Bool, Float64, Int64
+from roadscan.compute.array_types import Float64, Int64
 from roadscan.compute.arrays import SIGMA_OF_MAD
 
 COUNTS: Final = ("returns", "stopped", "passed", "under", "foot", "columns", "open_columns", "leaves")
@@ -38,13 +38,10 @@ _JOIN_LEVEL_M: Final = 0.15
 """Low surfaces join where they start at one height above the ground, within this (m): rail and solid end do not …"""
 _LOW_M: Final = 1.2
 """… and low ones are up to this height (m)."""
-_LEAST_LINES: Final = 15.0  # Fewer sight lines at a stretch do not tell whether it is porous.
-_MANY_PASSING: Final = 4.0  # So many lines that pass tell it, however few there are.
-_LEAST_PASSING: Final = 0.02  # Share of the sight lines that a porous stretch lets through.
 _SPARSER: Final = 1.0 / 3.0  # Below a free one stands so much less than above.
 _TELLING: Final = 5.0
 """Lines that would have been stopped, so many that by chance all pass in 0.7 % of the cases."""
-_LONGEST_STRETCH_M: Final = 1.5  # Surfaces are cut into stretches that are no longer (m).
+_LONGEST_STRETCH_M: Final = 1.5 * STRETCH_M  # No stretch is longer (m): their number is rounded.
 _SHORTEST_M: Final = 0.02  # Shorter pieces and gaps are left out (m).
 
 
@@ -83,11 +80,6 @@ class Chain:
         """Returns the share of the sight lines at it that pass through."""
         passed, stopped = float(self.values["passed"].sum()), float(self.values["stopped"].sum())
         return passed / max(passed + stopped, 1.0)
-
-    def lets_through(self) -> tuple[Bool, Bool]:
-        """Returns which stretches (k,) enough sight lines met to tell, and which of all let some through."""
-        passed, lines = self.values["passed"], self.values["passed"] + self.values["stopped"]
-        return (lines >= _LEAST_LINES) | (passed >= _MANY_PASSING), passed - 1.0 >= _LEAST_PASSING * lines
 
     def part(self, first: int, last: int) -> Chain:
         """Returns the chain of its stretches from the first to before the last."""

@@ -29,6 +29,9 @@ _MOST_AROUND: Final = 24
 """Stretches before and behind that are looked at; pieces of stretches at the borders of squares are short."""
 _LONGEST_M: Final = 40.0
 """Longer surfaces count as so long (m)."""
+_LEAST_LINES: Final = 15.0  # Fewer sight lines at a stretch do not tell whether it is porous.
+_MANY_PASSING: Final = 4.0  # So many lines that pass tell it, however few there are.
+_LEAST_PASSING: Final = 0.02  # Share of the sight lines that a porous stretch lets through.
 _LEAST_LINES_AROUND, _LEAST_BELOW = 15.0, 5.0
 """Fewer sight lines at the stretches around one, and below their lower edges, tell nothing."""
 
@@ -72,7 +75,9 @@ def _of_window(chain: Chain, near: _Near, heights: dict[str, Float64]) -> dict[s
     passed, stopped, under, foot = (near.sum(v[name]) for name in ("passed", "stopped", "under", "foot"))
     columns, opened = near.sum(v["columns"]), near.sum(v["open_columns"])
     lines = passed + stopped
-    told, through = chain.lets_through()
+    at_each = v["passed"] + v["stopped"]
+    told = (at_each >= _LEAST_LINES) | (v["passed"] >= _MANY_PASSING)
+    through = v["passed"] - 1.0 >= _LEAST_PASSING * at_each  # one line may be a false return
     told_m = near.sum(told * v["length_m"])
     # what lets a share of the lines through everywhere opens so many columns; openings in what is solid open fewer
     share = passed / np.maximum(lines, 1.0)
